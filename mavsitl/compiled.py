@@ -1,0 +1,55 @@
+"""Numba behind one decorator, so that each compiled text is also plain Python.
+
+``@compiled`` is ``numba.njit(cache=True)`` without fast-math: a compiled function gives, bit for bit, what its text gives
+un-jitted. Set ``MAVSITL_JIT=0`` to run the text itself (slow; for debuggers and for the test that holds the two together).
+
+Numba's cache does not notice a change in a function that a cached function calls. The cache therefore lives in a folder
+named by a digest of every source file of the packages that compile: a changed text never meets a stale cache.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+JIT = os.environ.get("MAVSITL_JIT", "1") != "0"
+_COMPILING_PACKAGES = ("mavsitl.control", "mavsitl_vehicle", "mavsitl_ground")
+
+
+def _source_digest() -> str:
+    digest = hashlib.blake2b(digest_size=8)
+    for name in _COMPILING_PACKAGES:
+        spec = find_spec(name)
+        for folder in spec.submodule_search_locations or () if spec else ():
+            for file in sorted(Path(folder).rglob("*.py")):
+                digest.update(file.read_bytes())
+    digest.update(Path(__file__).read_bytes())
+    return digest.hexdigest()
+
+
+def _set_up_cache() -> None:
+    import numba
+    import platformdirs
+
+    if "NUMBA_CACHE_DIR" not in os.environ:
+        folder = platformdirs.user_cache_path("mavsitl") / "compiled" / _source_digest()
+        numba.config.CACHE_DIR = str(folder)
+
+
+def compiled(function: F) -> F:
+    """Compile `function` with numba on its first call, cached on disk; the same text un-jitted under ``MAVSITL_JIT=0``."""
+    if not JIT:
+        return function
+    import numba
+
+    return cast("F", numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+
+
+if JIT:
+    _set_up_cache()

@@ -1,0 +1,388 @@
+"""Scenarios: one TOML file says what flies, in what air, under which controller. Strict, frozen, units in key names.
+
+``load`` finds a shipped scenario by name or reads a file by path, and raises `ScenarioError` with the file, the key and
+what is allowed for whatever it does not accept.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import msgspec
+
+from mavsitl.airframes import Airframe, NonNegative, Positive
+
+Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+Level: TypeAlias = Literal["attitude", "body_rate", "torque"]
+Vector3: TypeAlias = tuple[float, float, float]
+
+MICROSECONDS_PER_SECOND = 1_000_000
+
+
+class ScenarioError(ValueError):
+    """The user's scenario or airframe file is wrong; the message names the file, the key and what is allowed."""
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What all parts of a scenario share: frozen, and strict about unknown keys."""
+
+
+class Rates(Section):
+    physics_hz: Annotated[int, msgspec.Meta(ge=50, le=20_000)] = 1000
+    control_hz: Annotated[int, msgspec.Meta(ge=10, le=1000)] = 250
+    """Off-board cycle: telemetry out, setpoint in. A whole number of milliseconds, because the wire's stamp is in ms."""
+
+    @property
+    def control_period_us(self) -> int:
+        return MICROSECONDS_PER_SECOND // self.control_hz
+
+    @property
+    def substeps(self) -> int:
+        return self.physics_hz // self.control_hz
+
+
+class Start(Section):
+    position_nwu_m: Vector3 = (0.0, 0.0, 0.0)
+    yaw_deg: float = 0.0
+    clamp: bool = False
+    """Held at the start pose, rotors free, until it has been armed in OFFBOARD for COM_SPOOLUP_TIME."""
+
+
+class Offnominal(Section):
+    """What the vehicle is and the controller does not know."""
+
+    mass_scale: Positive = 1.0
+    inertia_scale: Positive = 1.0
+    rotor_thrust_scale: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (1.0, 1.0, 1.0, 1.0)
+
+
+class Steady(Section, tag_field="model", tag="steady"):
+    """A constant wind: the air moves along `velocity_nwu_m_s`."""
+
+    velocity_nwu_m_s: Vector3
+
+
+class Gust(Section, tag_field="model", tag="gust"):
+    """The 1-cosine gust of MIL-F-8785C: 0 before `start_s`, rising over `length_s` to its amplitude, then held or gone."""
+
+    velocity_nwu_m_s: Vector3
+    start_s: NonNegative
+    length_s: Positive
+    shape: Literal["pulse", "ramp"] = "pulse"
+
+
+class DrydenPaper(Section, tag_field="model", tag="dryden-paper"):
+    """Eqs 14-17 with Table 1's numbers (sigma_v = sigma_u^2 / sigma_w as printed, metres in the formulas)."""
+
+    wind_speed_20ft_m_s: Positive = 10.0
+    altitude_m: Positive = 1.0
+    form: Literal["first-order", "spectrum"] = "first-order"
+    """``first-order``: the filters of eq 17; ``spectrum``: second-order v and w filters that have eq 14's densities."""
+    intensity: Literal["two-pi", "unit"] = "two-pi"
+    """Intensity of eq 16's white noise: R(tau) = 2 pi delta(tau), which gives sigma, or delta(tau) as the words say."""
+
+
+class DrydenMil(Section, tag_field="model", tag="dryden-mil"):
+    """MIL-F-8785C / MIL-HDBK-1797 low-altitude model, turned with the mean wind; the mean itself included on request."""
+
+    wind_speed_20ft_m_s: Positive
+    altitude_m: Annotated[float, msgspec.Meta(gt=0.0, le=304.8)]
+    from_deg: float = 0.0
+    """Where the mean wind comes from, clockwise from north."""
+    include_mean: bool = False
+
+
+Wind: TypeAlias = Steady | Gust | DrydenPaper | DrydenMil
+
+
+class Noise(Section):
+    """1-sigma of the Gaussian white noise on every feedback variable (section 5 of the paper; levels: see the docs)."""
+
+    position_m: NonNegative = 0.005
+    velocity_m_s: NonNegative = 0.005
+    attitude_deg: NonNegative = 0.02
+    rate_deg_s: NonNegative = 0.1
+
+
+class Hover(Section, tag_field="kind", tag="hover"):
+    position_nwu_m: Vector3 = (0.0, 0.0, 1.0)
+    yaw_deg: float = 0.0
+
+
+class Spiral(Section, tag_field="kind", tag="spiral"):
+    """Section 5.2: X_d = [r sin(w t), r cos(w t), v t]."""
+
+    radius_m: Positive = 1.0
+    rate_rad_s: Positive = 0.2094
+    climb_m_s: float = 0.0333
+
+
+class Step(Section):
+    time_s: NonNegative
+    position_nwu_m: Vector3
+    yaw_deg: float = 0.0
+
+
+class Steps(Section, tag_field="kind", tag="steps"):
+    """Holds each position from its time on."""
+
+    steps: Annotated[tuple[Step, ...], msgspec.Meta(min_length=1)]
+
+
+class Figure8(Section, tag_field="kind", tag="figure-8"):
+    """A Gerono lemniscate, entered from its centre with a smooth start over `ramp_s`."""
+
+    length_m: Positive = 4.0
+    width_m: Positive = 2.0
+    period_s: Positive = 12.0
+    altitude_m: float = 1.0
+    ramp_s: NonNegative = 4.0
+
+
+class Waypoints(Section, tag_field="kind", tag="waypoints"):
+    """Straight legs at `speed_m_s` through the rows of a CSV file: x, y, z in metres NWU, yaw in degrees, hold in seconds."""
+
+    file: str
+    speed_m_s: Positive = 1.0
+
+
+Reference: TypeAlias = Hover | Spiral | Steps | Figure8 | Waypoints
+
+
+class Gains(Section):
+    """A PID on acceleration: acceleration = k_p e + k_i integral(e) + k_d e'."""
+
+    k_p_per_s2: NonNegative
+    k_i_per_s3: NonNegative
+    k_d_per_s: NonNegative
+
+
+class Learning(Section):
+    """On-line learning of the three PIDNNs, eqs 30-57, and the guards that keep it stable (docs: explanation/pidnn)."""
+
+    rate: tuple[NonNegative, NonNegative, NonNegative] = (10.0, 10.0, 10.0)
+    """eta of the P, I and D output weights (eq 31), relative to each weight's initial value."""
+    projection: tuple[Fraction, Annotated[float, msgspec.Meta(ge=1.0)]] | None = (0.5, 1.5)
+    """Output weights stay within these multiples of their initial value. Omit with `guards = false` only."""
+    leakage_per_s: NonNegative = 0.1
+    """Pull of each weight towards its initial value."""
+    dead_zone_deg: NonNegative = 0.1
+    """No learning from a tracking error smaller than this."""
+    guards: bool = True
+    """False: the law as printed, with no projection, leakage or dead zone. It diverges in turbulence."""
+    bound: Literal["derived", "printed", "none"] = "derived"
+    """Largest rate by eqs 54 and 57: 2 / (o delta)^2 as derived, 8 / (o delta)^2 as printed, or none."""
+    delta: Literal["known", "printed"] = "known"
+    """delta of eq 33: the known sign +1, or eq 37 as printed (0 where its denominator vanishes)."""
+    input_weights: Literal["fixed", "learned"] = "fixed"
+    """Input weights: +1 and -1 (eq 38), or learned by eqs 34-36."""
+
+
+class WindObserver(Section):
+    """Bandwidths of the velocity disturbance observer that stands in for W_1..W_3."""
+
+    horizontal_rad_s: Positive = 22.0
+    vertical_rad_s: Positive = 16.5
+
+
+class Controller(Section):
+    law: Literal["pidnn", "pid"] = "pidnn"
+    level: Level = "body_rate"
+    """Where the loop closes: q + thrust, body rates + thrust, or U1..U4 over the wire."""
+    inner: Literal["stock", "pidnn"] = "stock"
+    """Level `attitude` only: the vehicle's stock cascade, or the same PIDNN seated aboard."""
+    wind_information: Literal["oracle", "observer", "none"] = "observer"
+    """W_1..W_3 of eqs 19-26: true wind (no real vehicle has it), estimated from telemetry, or 0."""
+    telemetry: Literal["odometry", "split"] = "odometry"
+    """State from ODOMETRY, or from ATTITUDE_QUATERNION and LOCAL_POSITION_NED."""
+    derivative: Literal["rate", "difference"] = "rate"
+    """The D neuron's input: the measured body rate, or the differenced angle error of eq 28."""
+    altitude: Gains = Gains(k_p_per_s2=5.29, k_i_per_s3=0.608, k_d_per_s=6.67)
+    position: Gains = Gains(k_p_per_s2=9.92, k_i_per_s3=0.188, k_d_per_s=4.35)
+    roll_pitch: Gains = Gains(k_p_per_s2=961.0, k_i_per_s3=328.0, k_d_per_s=92.4)
+    yaw: Gains = Gains(k_p_per_s2=130.0, k_i_per_s3=148.0, k_d_per_s=22.8)
+    angle_filter_rad_s: NonNegative = 14.6
+    """First-order filter on phi_d and theta_d; 0 is none."""
+    tilt_limit_deg: Annotated[float, msgspec.Meta(gt=0.0, lt=90.0)] = 50.0
+    learning: Learning = Learning()
+    wind_observer: WindObserver = WindObserver()
+
+
+class Scenario(Section):
+    title: str
+    description: str = ""
+    duration_s: Positive = 60.0
+    """Flight time, from the release of the clamp or the first lift-off."""
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 1
+    airframe: str = "paper"
+    """A shipped airframe's name or the path of a TOML file."""
+    rates: Rates = Rates()
+    start: Start = Start()
+    offnominal: Offnominal = Offnominal()
+    ground_contact: bool = True
+    """False: no ground, as in the paper."""
+    wind: tuple[Wind, ...] = ()
+    """Summed."""
+    noise: Noise = Noise()
+    parameters: dict[str, float] = {}
+    """PX4 parameters of the vehicle, over the airframe's."""
+    controller: Controller = Controller()
+    reference: Reference = Hover()
+
+
+class Flight(msgspec.Struct, frozen=True):
+    """A scenario made ready: its file resolved, its airframe loaded."""
+
+    name: str
+    scenario: Scenario
+    airframe: Airframe
+
+
+def names() -> list[str]:
+    """The shipped scenarios."""
+    folder = resources.files("mavsitl") / "scenarios"
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
+    """Read a shipped scenario by name, or a file by path; `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``.
+
+    Raises `ScenarioError`.
+    """
+    text, where, folder = _read("scenarios", name_or_path, names())
+    data = _parse(text, where)
+    for key, value in (overrides or {}).items():
+        _override(data, key, value, where)
+    scenario = _convert(data, Scenario, where)
+    reference = scenario.reference
+    if isinstance(reference, Waypoints) and not Path(reference.file).is_absolute():
+        path = str(folder / reference.file)
+        scenario = msgspec.structs.replace(scenario, reference=msgspec.structs.replace(reference, file=path))
+    _check(scenario, where)
+    name = name_or_path.removesuffix(".toml").replace("\\", "/").rsplit("/", 1)[-1]
+    return Flight(name=name, scenario=scenario, airframe=load_airframe(scenario.airframe, folder))
+
+
+def load_airframe(name_or_path: str, folder: Path | None = None) -> Airframe:
+    """Read a shipped airframe by name, or a file by path (relative to `folder`). Raises `ScenarioError`."""
+    shipped = sorted(
+        entry.name.removesuffix(".toml")
+        for entry in (resources.files("mavsitl") / "airframes").iterdir()
+        if entry.name.endswith(".toml")
+    )
+    text, where, _ = _read("airframes", name_or_path, shipped, folder)
+    return _convert(_parse(text, where), Airframe, where)
+
+
+def _read(kind: str, name_or_path: str, shipped: list[str], folder: Path | None = None) -> tuple[str, str, Path]:
+    if name_or_path in shipped:
+        resource = resources.files("mavsitl") / kind / f"{name_or_path}.toml"
+        return resource.read_text("utf-8"), f"{name_or_path} (shipped)", Path()
+    path = (folder or Path()) / name_or_path
+    if path.suffix != ".toml":
+        raise ScenarioError(f"{name_or_path}: no such shipped file and not a .toml path; shipped {kind}: {', '.join(shipped)}")
+    try:
+        return path.read_text("utf-8"), str(path), path.parent
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: cannot be read: {error}") from error
+
+
+def _parse(text: str, where: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{where}: not valid TOML: {error}") from error
+
+
+def _override(data: dict[str, Any], key: str, value: Any, where: str) -> None:
+    *parents, last = key.split(".")
+    table = data
+    for parent in parents:
+        table = table.setdefault(parent, {})
+        if not isinstance(table, dict):
+            raise ScenarioError(f"{where}: {key}: '{parent}' is not a table, so it has no key to set")
+    table[last] = value
+
+
+def _convert(data: dict[str, Any], kind: type[Any], where: str) -> Any:
+    for problem in _problems(data, msgspec.inspect.type_info(kind), ""):
+        raise ScenarioError(f"{where}: {problem}")
+    try:
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        reason, _, path = str(error).partition(" - at `$")
+        key = path.rstrip("`").lstrip(".") or "top level"
+        raise ScenarioError(f"{where}: {key}: {reason}") from error
+
+
+def _problems(data: Any, info: msgspec.inspect.Type, path: str) -> Iterator[str]:
+    """What msgspec's own message would not say in full: unknown keys with the allowed ones, and numbers that are not finite."""
+    if isinstance(data, float) and not math.isfinite(data):
+        yield f"{path}: {data} is not allowed; a finite number is"
+    if isinstance(info, msgspec.inspect.UnionType):
+        structs = [t for t in info.types if isinstance(t, msgspec.inspect.StructType)]
+        if structs and isinstance(data, dict):
+            field = structs[0].tag_field
+            tags = {t.tag: t for t in structs}
+            if field is not None and data.get(field) not in tags:
+                allowed = ", ".join(str(tag) for tag in tags)
+                yield f"{_join(path, field)}: {data.get(field, 'missing')!r} is not allowed; allowed: {allowed}"
+            elif field is not None:
+                yield from _problems(data, tags[data[field]], path)
+        else:
+            for option in info.types:
+                if isinstance(option, msgspec.inspect.TupleType) and isinstance(data, list):
+                    yield from _problems(data, option, path)
+    elif isinstance(info, msgspec.inspect.StructType) and isinstance(data, dict):
+        fields = {field.encode_name: field for field in info.fields}
+        allowed_keys = [*([info.tag_field] if info.tag_field else []), *fields]
+        for key, value in data.items():
+            if key not in allowed_keys:
+                yield f"{_join(path, key)}: unknown key; allowed here: {', '.join(allowed_keys)}"
+            elif key in fields:
+                yield from _problems(value, fields[key].type, _join(path, key))
+    elif isinstance(data, list):
+        item = getattr(info, "item_type", None)
+        items = getattr(info, "item_types", ())
+        for index, value in enumerate(data):
+            inner = item if item is not None else items[index] if index < len(items) else None
+            if inner is not None:
+                yield from _problems(value, inner, f"{path}[{index}]")
+    elif isinstance(info, msgspec.inspect.DictType) and isinstance(data, dict):
+        for key, value in data.items():
+            yield from _problems(value, info.value_type, _join(path, key))
+    elif isinstance(info, msgspec.inspect.Metadata):
+        yield from _problems(data, info.type, path)
+
+
+def _join(path: str, key: str) -> str:
+    return f"{path}.{key}" if path else key
+
+
+def _check(scenario: Scenario, where: str) -> None:
+    """Rules that tie keys together."""
+    rates = scenario.rates
+    if rates.physics_hz % rates.control_hz:
+        raise ScenarioError(
+            f"{where}: rates.physics_hz: {rates.physics_hz} is not a multiple of rates.control_hz ({rates.control_hz})"
+        )
+    if 1000 % rates.control_hz:
+        raise ScenarioError(
+            f"{where}: rates.control_hz: one cycle of {rates.control_hz} Hz is not a whole number of milliseconds; allowed: "
+            + ", ".join(str(hz) for hz in range(10, 1001) if 1000 % hz == 0)
+        )
+    if MICROSECONDS_PER_SECOND % rates.physics_hz:
+        raise ScenarioError(f"{where}: rates.physics_hz: one step of {rates.physics_hz} Hz is not a whole number of microseconds")
+    controller = scenario.controller
+    if controller.inner == "pidnn" and controller.level != "attitude":
+        raise ScenarioError(f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'")
+    if controller.learning.guards and controller.learning.projection is None:
+        raise ScenarioError(f"{where}: controller.learning.projection: may be left out only with guards = false")
+    steps = scenario.reference.steps if isinstance(scenario.reference, Steps) else ()
+    if any(later.time_s <= earlier.time_s for earlier, later in zip(steps, steps[1:], strict=False)):
+        raise ScenarioError(f"{where}: reference.steps: time_s must increase from step to step")
