@@ -6,7 +6,7 @@ what is allowed for whatever it does not accept.
 
 from __future__ import annotations
 
-import math
+import sys
 import tomllib
 from collections.abc import Iterator
 from importlib import resources
@@ -321,43 +321,124 @@ def _convert(data: dict[str, Any], kind: type[Any], where: str) -> Any:
 
 
 def _problems(data: Any, info: msgspec.inspect.Type, path: str) -> Iterator[str]:
-    """What msgspec's own message would not say in full: unknown keys with the allowed ones, and numbers that are not finite."""
-    if isinstance(data, float) and not math.isfinite(data):
-        yield f"{path}: {data} is not allowed; a finite number is"
-    if isinstance(info, msgspec.inspect.UnionType):
-        structs = [t for t in info.types if isinstance(t, msgspec.inspect.StructType)]
-        if structs and isinstance(data, dict):
-            field = structs[0].tag_field
-            tags = {t.tag: t for t in structs}
-            if field is not None and data.get(field) not in tags:
-                allowed = ", ".join(str(tag) for tag in tags)
-                yield f"{_join(path, field)}: {data.get(field, 'missing')!r} is not allowed; allowed: {allowed}"
-            elif field is not None:
-                yield from _problems(data, tags[data[field]], path)
-        else:
-            for option in info.types:
-                if isinstance(option, msgspec.inspect.TupleType) and isinstance(data, list):
-                    yield from _problems(data, option, path)
-    elif isinstance(info, msgspec.inspect.StructType) and isinstance(data, dict):
-        fields = {field.encode_name: field for field in info.fields}
-        allowed_keys = [*([info.tag_field] if info.tag_field else []), *fields]
-        for key, value in data.items():
-            if key not in allowed_keys:
-                yield f"{_join(path, key)}: unknown key; allowed here: {', '.join(allowed_keys)}"
-            elif key in fields:
-                yield from _problems(value, fields[key].type, _join(path, key))
-    elif isinstance(data, list):
-        item = getattr(info, "item_type", None)
-        items = getattr(info, "item_types", ())
-        for index, value in enumerate(data):
-            inner = item if item is not None else items[index] if index < len(items) else None
-            if inner is not None:
-                yield from _problems(value, inner, f"{path}[{index}]")
-    elif isinstance(info, msgspec.inspect.DictType) and isinstance(data, dict):
-        for key, value in data.items():
-            yield from _problems(value, info.value_type, _join(path, key))
-    elif isinstance(info, msgspec.inspect.Metadata):
-        yield from _problems(data, info.type, path)
+    """What msgspec's own message would not say in full: each problem with its key and what is allowed there."""
+    fits = True
+    match info:
+        case msgspec.inspect.Metadata():
+            yield from _problems(data, info.type, path)
+        case msgspec.inspect.UnionType():
+            options = [option for option in info.types if not isinstance(option, msgspec.inspect.NoneType)]
+            tags = {option.tag: option for option in options if isinstance(option, msgspec.inspect.StructType)}
+            field = next((option.tag_field for option in tags.values()), None)
+            if field is not None and isinstance(data, dict):
+                tag = data.get(field)
+                if isinstance(tag, str) and tag in tags:
+                    yield from _problems(data, tags[tag], path)
+                else:
+                    allowed = ", ".join(f"'{name}'" for name in tags)
+                    found = f"{_shown(tag)} is not allowed" if field in data else "missing"
+                    yield f"{_join(path, field)}: {found}; allowed: {allowed}"
+            elif len(options) == 1:
+                yield from _problems(data, options[0], path)
+            else:
+                fits = field is None
+        case msgspec.inspect.StructType() if isinstance(data, dict):
+            fields = {field.encode_name: field for field in info.fields}
+            allowed_keys = [*([info.tag_field] if info.tag_field else []), *fields]
+            for key, value in data.items():
+                if key not in allowed_keys:
+                    yield f"{_join(path, key)}: unknown key; allowed here: {', '.join(allowed_keys)}"
+                elif key in fields:
+                    yield from _problems(value, fields[key].type, _join(path, key))
+            for key, struct_field in fields.items():
+                if struct_field.required and key not in data:
+                    yield f"{_join(path, key)}: missing; allowed: {describe(struct_field.type)}"
+        case msgspec.inspect.TupleType() if isinstance(data, list) and len(data) == len(info.item_types):
+            for index, (value, item) in enumerate(zip(data, info.item_types, strict=True)):
+                yield from _problems(value, item, f"{path}[{index}]")
+        case msgspec.inspect.VarTupleType() if isinstance(data, list):
+            fits = len(data) >= (info.min_length or 0)
+            for index, value in enumerate(data):
+                yield from _problems(value, info.item_type, f"{path}[{index}]")
+        case msgspec.inspect.DictType() if isinstance(data, dict):
+            for key, value in data.items():
+                yield from _problems(value, info.value_type, _join(path, key))
+        case msgspec.inspect.LiteralType():
+            fits = data in info.values
+        case msgspec.inspect.FloatType() if isinstance(data, int | float) and not isinstance(data, bool):
+            fits = -sys.float_info.max <= data <= sys.float_info.max and _within_bounds(data, info)
+        case msgspec.inspect.IntType() if isinstance(data, int) and not isinstance(data, bool):
+            fits = _within_bounds(data, info)
+        case msgspec.inspect.StrType():
+            fits = isinstance(data, str)
+        case msgspec.inspect.BoolType():
+            fits = isinstance(data, bool)
+        case _:
+            fits = False
+    if not fits:
+        yield f"{path}: {_shown(data)} is not allowed; allowed: {describe(info)}"
+
+
+def describe(info: msgspec.inspect.Type) -> str:
+    """What a key of this type takes, in words: for error messages, and for the table of keys in the docs."""
+    match info:
+        case msgspec.inspect.Metadata():
+            return describe(info.type)
+        case msgspec.inspect.FloatType() | msgspec.inspect.IntType():
+            whole = "whole number" if isinstance(info, msgspec.inspect.IntType) else "number"
+            bounds = ((">", info.gt), (">=", info.ge), ("<", info.lt), ("<=", info.le))
+            return " ".join(
+                [whole, " and ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)]
+            ).strip()
+        case msgspec.inspect.LiteralType():
+            return ", ".join(f"'{value}'" for value in info.values)
+        case msgspec.inspect.StrType():
+            return "text"
+        case msgspec.inspect.BoolType():
+            return "true, false"
+        case msgspec.inspect.TupleType():
+            items = [describe(item) for item in info.item_types]
+            return f"array of {len(items)}: {items[0] if len(set(items)) == 1 else ', '.join(items)}"
+        case msgspec.inspect.VarTupleType():
+            return f"array{f' of at least {info.min_length}' if info.min_length else ''}: {describe(info.item_type)}"
+        case msgspec.inspect.DictType():
+            return f"table of names: {describe(info.value_type)}"
+        case msgspec.inspect.UnionType():
+            options = [option for option in info.types if not isinstance(option, msgspec.inspect.NoneType)]
+            structs = [option for option in options if isinstance(option, msgspec.inspect.StructType)]
+            if structs and structs[0].tag_field is not None:
+                return f"table with {structs[0].tag_field} = {', '.join(repr(struct.tag) for struct in structs)}"
+            return " or ".join(describe(option) for option in options)
+        case msgspec.inspect.StructType():
+            return f"table of {', '.join(field.encode_name for field in info.fields)}"
+        case _:
+            raise NotImplementedError(f"no words for {info}")
+
+
+def _within_bounds(value: float, info: msgspec.inspect.FloatType | msgspec.inspect.IntType) -> bool:
+    return (
+        (info.gt is None or value > info.gt)
+        and (info.ge is None or value >= info.ge)
+        and (info.lt is None or value < info.lt)
+        and (info.le is None or value <= info.le)
+    )
+
+
+def _shown(data: Any) -> str:
+    """The user's own value, as TOML would write it, at a length that fits a message."""
+    match data:
+        case dict():
+            return "a table"
+        case list():
+            return f"an array of {len(data)}"
+        case bool():
+            return str(data).lower()
+        case str():
+            return repr(data if len(data) <= 40 else f"{data[:40]}...")
+        case int() if abs(data) >= 10**40:
+            return "a whole number of more than 40 digits"
+        case _:
+            return str(data)
 
 
 def _join(path: str, key: str) -> str:

@@ -1,0 +1,26 @@
+"""Sphinx configuration of mavsitl's documentation."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import mavsitl
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+
+project = "mavsitl"
+author = "the mavsitl developers"
+copyright = "the mavsitl developers, Apache-2.0"  # noqa: A001 (Sphinx's own name)
+version = release = mavsitl.__version__
+
+extensions = ["myst_parser", "generated"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build", "_ext"]
+nitpicky = True
+smartquotes = False  # quoted values are TOML
+
+html_theme = "furo"
+html_title = f"mavsitl {release}"
+html_show_sourcelink = False

@@ -1,0 +1,339 @@
+"""The paper's controller as an off-board process: telemetry in, observer, reference, PID, PIDNN, setpoint out. Sans-IO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import exp, radians, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavsitl.codec import packer
+from mavsitl.control.filters import FirstOrder
+from mavsitl.control.inner_loop import InnerLoop
+from mavsitl.control.pid import PositionLoop
+from mavsitl.control.wind_observer import WindObserver, model_acceleration
+from mavsitl.dialect import mavlink
+from mavsitl.frames import flip_euler, flip_vector
+from mavsitl.log import topics
+from mavsitl.log.ulog import Recorder
+from mavsitl.node import Node
+from mavsitl.quaternion import from_euler
+from mavsitl.scenario import Flight, ScenarioError
+from mavsitl_ground import demand
+from mavsitl_ground.observer import Observer
+from mavsitl_ground.reference import reference_for
+from mavsitl_ground.sequence import ENDED, Handshake, Phase
+
+Array = NDArray[np.float64]
+
+SYSTEM_ID = 250
+COMPONENT_ID = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
+HEARTBEAT_INTERVAL_US = 1_000_000
+
+HEARTBEAT = packer(mavlink.MAVLink_heartbeat_message)
+COMMAND_LONG = packer(mavlink.MAVLink_command_long_message)
+
+STATE_MESSAGES = {
+    "odometry": (mavlink.MAVLINK_MSG_ID_ODOMETRY,),
+    "split": (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED),
+}
+SYS_STATE_INTERVAL_US = 200_000
+
+
+class Controller:
+    """The paper's nested loops (fig 3) for one vehicle, from state to demand; no message, no clock but the vehicle's stamp."""
+
+    def __init__(self, flight: Flight) -> None:
+        """Raises `ScenarioError` where the airframe does not say what the command level needs."""
+        scenario, airframe = flight.scenario, flight.airframe
+        settings = scenario.controller
+        self._airframe = airframe
+        self._settings = settings
+        self._period_s = scenario.rates.control_period_us / 1e6
+        self._reference = reference_for(scenario.reference)
+        self._outer = PositionLoop(
+            settings.altitude, settings.position, airframe.mass_kg, airframe.gravity_m_s2,
+            radians(settings.tilt_limit_deg), airframe.max_thrust_n, self._period_s,
+        )  # fmt: skip
+        self._filter = FirstOrder(settings.angle_filter_rad_s, self._period_s, rows=2)
+        self._inner = InnerLoop(settings, airframe, self._period_s)
+        self._wind_observer = WindObserver(settings.wind_observer.horizontal_rad_s, settings.wind_observer.vertical_rad_s)
+        self._rate_gain = _rate_gain(flight) if settings.level == "body_rate" else np.ones((3, 1))
+        tau = airframe.rotor_time_constant_s
+        self._thrust_share = 1.0 - exp(-self._period_s / tau) if tau > 0.0 else 1.0
+        area = np.pi * airframe.rotor_radius_m**2
+        self._coupling = airframe.wind_coupling * sqrt(8.0 * airframe.air_density_kg_m3 * area) / airframe.mass_kg
+        self._position = np.zeros((3, 1))
+        self._velocity = np.zeros((3, 1))
+        self._acceleration = np.zeros((3, 1))
+        self._model = np.zeros((3, 1))
+        self._desired = np.zeros((3, 1))
+        self._desired_rates = np.zeros((3, 1))
+        self._tilt = np.zeros((2, 1))
+        self._no_wind = np.zeros((3, 1))
+        self._acting_thrust = np.array([airframe.weight_n])
+        self.wind_acceleration = self._no_wind
+        """W_1..W_3 as used, m/s^2 NWU (3, 1)."""
+        self.reference = self._reference.sample(0.0)
+        """Position m, velocity m/s, acceleration m/s^2 (NWU) and yaw rad as last used."""
+        self.thrust_n = airframe.weight_n
+        self.omega_acceleration = np.zeros((3, 1))
+        """What the inner loop asked for, rad/s^2 FLU (3, 1)."""
+        self.reset()
+
+    @property
+    def desired_rad(self) -> Array:
+        """phi_d, theta_d, psi_d as handed to the inner loop (3, 1)."""
+        return self._desired
+
+    @property
+    def weights(self) -> Array | None:
+        """The PIDNN's output weights (3 outputs, 3 axes, 1); None for the PID."""
+        return self._inner.weights
+
+    def reset(self) -> None:
+        """At rest at the start of a flight: integrators empty, nets as the identical PID, rotors at hover."""
+        self._outer.reset()
+        self._filter.reset()
+        self._inner.reset()
+        self._wind_observer.reset()
+        self._acting_thrust[0] = self._airframe.weight_n
+        self.thrust_n = self._airframe.weight_n
+        self._stamp_us = -1
+
+    def update(self, time_s: float, state: Observer) -> None:
+        """One control cycle at flight time `time_s`; fills thrust_n, desired_rad and omega_acceleration."""
+        self.reference = self._reference.sample(time_s)
+        position, velocity, acceleration, yaw = self.reference
+        self._position[:, 0] = position
+        self._velocity[:, 0] = velocity
+        self._acceleration[:, 0] = acceleration
+        self.wind_acceleration = self._wind(state)
+        thrust, phi, theta = self._outer.update(
+            state.position_nwu_m, state.velocity_nwu_m_s, state.quaternion,
+            self._position, self._velocity, self._acceleration, state.angles_rad[2], self.wind_acceleration,
+        )  # fmt: skip
+        self._tilt[0, 0], self._tilt[1, 0] = phi[0], theta[0]
+        self._filter.update(self._tilt)
+        self._desired[:2] = self._filter.value
+        self._desired_rates[:2] = self._filter.rate
+        self._desired[2, 0] = yaw
+        self.thrust_n = float(thrust[0])
+        if self._settings.level != "attitude":
+            self.omega_acceleration = self._inner.update(
+                state.angles_rad, state.omega_flu_rad_s, self._desired, self._desired_rates
+            )
+
+    def _wind(self, state: Observer) -> Array:
+        """W_1..W_3 of eq 11 by the scenario's source; the rotors' lag is part of the model where the airframe has one."""
+        self._acting_thrust += self._thrust_share * (self.thrust_n - self._acting_thrust)
+        source = self._settings.wind_information
+        if source == "oracle":
+            if state.true_wind_nwu_m_s is None:
+                return self._no_wind
+            return self._coupling * sqrt(max(float(self._acting_thrust[0]), 0.0)) * state.true_wind_nwu_m_s
+        if source == "none":
+            return self._no_wind
+        airframe = self._airframe
+        model_acceleration(state.quaternion, self._acting_thrust, airframe.mass_kg, airframe.gravity_m_s2, self._model)
+        period_s = self._period_s if self._stamp_us < 0 else (state.stamp_us - self._stamp_us) / 1e6
+        self._stamp_us = state.stamp_us
+        return self._wind_observer.update(state.velocity_nwu_m_s, self._model, period_s)
+
+    def rates_flu_rad_s(self, state: Observer) -> Array:
+        """Level `body_rate`: the rate setpoint that makes a proportional rate loop give the wanted angular acceleration."""
+        return state.omega_flu_rad_s + self.omega_acceleration / self._rate_gain
+
+    def torque_shares(self) -> list[float]:
+        shares: list[float] = self._inner.torque_shares(self.omega_acceleration)[:, 0].tolist()
+        return shares
+
+    def u(self) -> tuple[float, float, float, float]:
+        """U_1..U_4 of eq 12: N, N, N, N m."""
+        x, y, z = self._inner.torque_n_m(self.omega_acceleration)[:, 0].tolist()
+        arm = self._airframe.arm_m
+        return self.thrust_n, x / arm, y / arm, z
+
+
+def _rate_gain(flight: Flight) -> Array:
+    """Angular acceleration per rad/s of rate error of the vehicle's rate loop (3, 1), 1/s, from its MC_*RATE_P."""
+    airframe, gains = flight.airframe, []
+    parameters = airframe.parameters | flight.scenario.parameters
+    for axis, torque, inertia in zip(("ROLL", "PITCH", "YAW"), airframe.max_torque_n_m, airframe.inertia_kg_m2, strict=True):
+        name = f"MC_{axis}RATE_P"
+        if not parameters.get(name, 0.0) > 0.0:
+            raise ScenarioError(f"{flight.name}: parameters.{name}: level 'body_rate' needs it in the airframe or the scenario")
+        gains.append([parameters[name] * torque / inertia])
+    return np.array(gains)
+
+
+class Ground:
+    """The off-board process' core: MAVLink endpoint, handshake, controller and log. A driver of the bridge runs it."""
+
+    def __init__(
+        self,
+        flight: Flight,
+        recorder: Recorder,
+        *,
+        report: Callable[[str], None] = lambda text: None,
+        vehicle_system_id: int | None = None,
+    ) -> None:
+        """`report` gets a line at each step of the handshake and each STATUSTEXT of the vehicle."""
+        scenario = flight.scenario
+        self.period_us = scenario.rates.control_period_us
+        self._scenario = scenario
+        self._level = scenario.controller.level
+        self._node = Node(SYSTEM_ID, COMPONENT_ID)
+        self._observer = Observer()
+        self._controller = Controller(flight)
+        self._report = report
+        messages = [(message_id, self.period_us) for message_id in STATE_MESSAGES[scenario.controller.telemetry]]
+        messages.append((mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, SYS_STATE_INTERVAL_US))
+        if scenario.controller.wind_information == "oracle":
+            messages.append((mavlink.MAVLINK_MSG_ID_DEBUG_VECT, self.period_us))
+        self._handshake = Handshake(
+            self._send_command, messages, land=scenario.ground_contact, system_id=vehicle_system_id, report=report
+        )
+        self._hover_thrust = 1.0 / flight.airframe.thrust_to_weight
+        self._max_thrust_n = flight.airframe.max_thrust_n
+        self._released_us: int | None = None
+        self._heartbeat_us = -HEARTBEAT_INTERVAL_US
+        self._trajectory = recorder.topic(topics.TRAJECTORY_SETPOINT)
+        self._attitude = recorder.topic(topics.ATTITUDE_SETPOINT)
+        self._demand = recorder.topic(topics.CONTROL_DEMAND)
+        self._weights = recorder.topic(topics.PIDNN_WEIGHTS)
+        self._link = recorder.topic(topics.LINK_STATUS)
+        self._now_us = 0
+
+    @property
+    def phase(self) -> str:
+        return self._handshake.phase.name
+
+    @property
+    def finished(self) -> bool:
+        return self._handshake.phase in ENDED
+
+    @property
+    def succeeded(self) -> bool:
+        return self._handshake.phase is Phase.DONE
+
+    @property
+    def flight_time_s(self) -> float:
+        """By the vehicle's clock since the release; negative before it."""
+        return -1.0 if self._released_us is None else (self._observer.stamp_us - self._released_us) / 1e6
+
+    @property
+    def vehicle_time_us(self) -> int:
+        """The vehicle's clock at the newest state; -1 before the first."""
+        return self._observer.stamp_us
+
+    @property
+    def counters(self) -> Any:
+        return self._node.counters
+
+    def receive(self, port: int, datagram: bytes) -> int:
+        """One datagram from the link; the number of valid frames in it."""
+        frames = self._node.receive(datagram)
+        handshake = self._handshake
+        for frame in frames:
+            message = frame.message
+            if type(message).id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+                handshake.on_heartbeat(message, frame.system_id, frame.component_id, self._now_us)
+            elif handshake.accepts(frame.system_id, frame.component_id):
+                self._observer.receive(message, self._now_us)
+                handshake.on_message(message)
+                if type(message).id == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
+                    self._report(f"vehicle: {message.text}")
+        return len(frames)
+
+    def step(self, now_us: int) -> None:
+        """At least every control period, and after each datagram: control on new state, handshake, heartbeat."""
+        self._now_us = now_us
+        handshake, state = self._handshake, self._observer
+        if state.restarted:
+            handshake.lose("its clock went back, it has restarted", now_us)
+        before = handshake.phase
+        handshake.step(now_us)
+        if handshake.phase is Phase.SEARCH and before is not Phase.SEARCH:
+            self._observer.reset()
+            self._controller.reset()
+            self._released_us = None
+        if handshake.phase is Phase.FLY and self._released_us is None:
+            self._released_us = state.stamp_us
+        if state.fresh:
+            state.take()
+            self._control(now_us)
+        if now_us - self._heartbeat_us >= HEARTBEAT_INTERVAL_US:
+            self._heartbeat_us = now_us
+            self._node.send(
+                HEARTBEAT, mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+            )
+
+    def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
+        return self._node.datagrams(combine=combine)
+
+    def _control(self, now_us: int) -> None:
+        handshake, state, controller = self._handshake, self._observer, self._controller
+        target = handshake.target
+        if target is None:
+            return
+        if self._released_us is None or not (handshake.in_control or handshake.phase is Phase.STOP):
+            controller.reset()
+            thrust = self._hover_thrust if handshake.armed else 0.0
+            self._send_idle(target, thrust)
+            return
+        time_s = (state.stamp_us - self._released_us) / 1e6
+        controller.update(time_s, state)
+        thrust = controller.thrust_n / self._max_thrust_n
+        phi, theta, psi = controller.desired_rad[:, 0].tolist()
+        if self._level == "attitude":
+            demand.send_attitude(self._node, target, state.stamp_us, from_euler(phi, theta, psi), thrust)
+        elif self._level == "body_rate":
+            p, q, r = controller.rates_flu_rad_s(state)[:, 0].tolist()
+            demand.send_rates(self._node, target, state.stamp_us, (p, q, r), thrust)
+        else:
+            demand.send_torque(self._node, target, state.stamp_us, controller.torque_shares(), thrust)
+        self._write_log(thrust)
+        if handshake.phase is Phase.FLY and time_s >= self._scenario.duration_s:
+            handshake.finish(now_us)
+
+    def _send_idle(self, target: tuple[int, int], thrust: float) -> None:
+        """Before the flight and while not in control: level, no rates; it keeps the stream, and lock-step, going."""
+        stamp_us = self._observer.stamp_us
+        if self._level == "attitude":
+            yaw_rad = float(self._observer.angles_rad[2, 0])
+            demand.send_attitude(self._node, target, stamp_us, from_euler(0.0, 0.0, yaw_rad), thrust)
+        elif self._level == "body_rate":
+            demand.send_rates(self._node, target, stamp_us, (0.0, 0.0, 0.0), thrust)
+        else:
+            demand.send_torque(self._node, target, stamp_us, (0.0, 0.0, 0.0), thrust)
+
+    def _write_log(self, thrust: float) -> None:
+        state, controller = self._observer, self._controller
+        stamp_us = state.stamp_us
+        (x, y, z), (vx, vy, vz), _, yaw = controller.reference
+        self._trajectory.append(stamp_us, *flip_vector(x, y, z), *flip_vector(vx, vy, vz), -yaw)
+        phi, theta, psi = controller.desired_rad[:, 0].tolist()
+        self._attitude.append(stamp_us, *flip_euler(phi, theta, psi), 0.0, 0.0, -thrust)
+        self._demand.append(stamp_us, *controller.u(), *controller.wind_acceleration[:, 0].tolist())
+        weights = controller.weights
+        if weights is not None:
+            self._weights.append(stamp_us, *weights[:, :, 0].T.ravel().tolist())
+        counters = self._node.counters
+        age_us = state.age_us(self._now_us) or 0
+        source = self._node.sources.get(self._handshake.target or (0, 0))
+        lost = 0 if source is None else source.lost
+        self._link.append(stamp_us, counters.frames, lost, counters.rejected, age_us)
+
+    def _send_command(self, command: int, confirmation: int, params: tuple[float, ...]) -> None:
+        system_id, component_id = self._handshake.target or (0, 0)
+        self._node.send(COMMAND_LONG, system_id, component_id, command, confirmation, *params)
+
+
+def build(flight: Flight, recorder: Recorder, **options: Any) -> Ground:
+    """The entry point `mavsitl.ground`: a ground core for the bridge's drivers."""
+    return Ground(flight, recorder, **options)
+
+

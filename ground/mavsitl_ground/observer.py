@@ -1,0 +1,107 @@
+"""Telemetry to state: the vehicle as the controller knows it, with its age and validity. The ground's frame boundary in."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from mavsitl.dialect import mavlink
+from mavsitl.frames import flip_quaternion, flip_vector
+from mavsitl.quaternion import normalise, rotate, to_euler
+
+Frames = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
+
+
+class Observer:
+    """State arrays with the fleet axis, n = 1, filled from ODOMETRY or from ATTITUDE_QUATERNION and LOCAL_POSITION_NED.
+
+    `stamp_us` is the vehicle's clock at the newest attitude; `fresh` says that it is new since `take`.
+    """
+
+    def __init__(self, max_age_us: int = 500_000) -> None:
+        self._max_age_us = max_age_us
+        self.position_nwu_m = np.zeros((3, 1))
+        self.velocity_nwu_m_s = np.zeros((3, 1))
+        self.quaternion = np.array([[1.0], [0.0], [0.0], [0.0]])
+        self.angles_rad = np.zeros((3, 1))
+        self.omega_flu_rad_s = np.zeros((3, 1))
+        self.true_wind_nwu_m_s: np.ndarray[Any, np.dtype[np.float64]] | None = None
+        """From DEBUG_VECT "WIND_TRUE": the oracle's. None until one came."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: another vehicle, or the same after a restart."""
+        self.stamp_us = -1
+        self.restarted = False
+        """The vehicle's clock went backwards by more than a second."""
+        self._position_us = -1
+        self._received_us = -1
+        self._fresh = False
+        self.true_wind_nwu_m_s = None
+
+    @property
+    def fresh(self) -> bool:
+        """A new attitude since the last `take`, and a position and velocity that go with it."""
+        return self._fresh and self._position_us >= 0 and self.stamp_us - self._position_us <= self._max_age_us
+
+    def take(self) -> None:
+        self._fresh = False
+
+    def age_us(self, now_us: int) -> int | None:
+        """Since the newest state came, on the ground's clock; None before the first."""
+        return None if self._received_us < 0 else now_us - self._received_us
+
+    def valid(self, now_us: int) -> bool:
+        age = self.age_us(now_us)
+        return age is not None and age <= self._max_age_us
+
+    def receive(self, message: Any, now_us: int) -> None:
+        """A message of the vehicle; others than the four below are ignored, and so is one with a value that is not finite."""
+        kind = type(message).id
+        if kind == mavlink.MAVLINK_MSG_ID_ODOMETRY:
+            self._on_odometry(message, now_us)
+        elif kind == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
+            q = (message.q1, message.q2, message.q3, message.q4)
+            self._attitude(q, (message.rollspeed, message.pitchspeed, message.yawspeed), message.time_boot_ms * 1000, now_us)
+        elif kind == mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+            position, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
+            self._position(position, velocity, message.time_boot_ms * 1000)
+        elif kind == mavlink.MAVLINK_MSG_ID_DEBUG_VECT and message.name == "WIND_TRUE":
+            self.true_wind_nwu_m_s = np.array(flip_vector(message.x, message.y, message.z))[:, np.newaxis]
+
+    def _on_odometry(self, message: Any, now_us: int) -> None:
+        if message.frame_id != mavlink.MAV_FRAME_LOCAL_NED or message.child_frame_id not in Frames:
+            return
+        q = tuple(message.q)
+        velocity = (message.vx, message.vy, message.vz)
+        if message.child_frame_id == mavlink.MAV_FRAME_BODY_FRD:
+            velocity = rotate(normalise(q), velocity)
+        self._attitude(q, (message.rollspeed, message.pitchspeed, message.yawspeed), message.time_usec, now_us)
+        self._position((message.x, message.y, message.z), velocity, message.time_usec)
+
+    def _attitude(self, q: Any, rates: Any, stamp_us: int, now_us: int) -> None:
+        w, x, y, z = q
+        if not (abs(w * w + x * x + y * y + z * z - 1.0) <= 0.05 and isfinite(sum(rates))):
+            return
+        if stamp_us < self.stamp_us:
+            if self.stamp_us - stamp_us > 1_000_000:
+                self.restarted = True
+            return
+        unit = normalise(flip_quaternion(*q))
+        self.quaternion[:, 0] = unit
+        self.angles_rad[:, 0] = to_euler(unit)
+        self.omega_flu_rad_s[:, 0] = flip_vector(*rates)
+        self._fresh = self._fresh or stamp_us > self.stamp_us
+        self.stamp_us = stamp_us
+        self._received_us = now_us
+
+    def _position(self, position: Any, velocity: Any, stamp_us: int) -> None:
+        if not isfinite(sum(position) + sum(velocity)) or stamp_us < self._position_us:
+            return
+        self.position_nwu_m[:, 0] = flip_vector(*position)
+        self.velocity_nwu_m_s[:, 0] = flip_vector(*velocity)
+        self._position_us = stamp_us
+
+

@@ -1,0 +1,214 @@
+"""The handshake that brings a vehicle into OFFBOARD and back: one table of phases, stepped with the time.
+
+SEARCH -> CONNECT -> STREAM -> OFFBOARD -> ARM -> RELEASE -> FLY -> STOP -> DONE; a silent or restarted vehicle leads back to
+SEARCH from anywhere, a vehicle that somebody else disarmed in flight to ABORTED.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import Enum, auto
+from math import nan
+from typing import Any
+
+from mavsitl.dialect import mavlink
+from mavsitl.services.command import CommandClient
+
+PX4_MAIN_MODE_OFFBOARD = 6
+HEARTBEAT_TIMEOUT_US = 3_000_000
+STREAM_TIME_US = 500_000
+"""Setpoints flow this long before OFFBOARD is asked for; PX4 wants to see a stream first."""
+RETRY_US = 1_000_000
+"""After a refusal."""
+FORCE_DISARM = 21196.0
+
+
+class Phase(Enum):
+    SEARCH = auto()
+    CONNECT = auto()
+    STREAM = auto()
+    OFFBOARD = auto()
+    ARM = auto()
+    RELEASE = auto()
+    FLY = auto()
+    STOP = auto()
+    DONE = auto()
+    ABORTED = auto()
+
+
+ENDED = (Phase.DONE, Phase.ABORTED)
+
+
+class Handshake:
+    """What to ask of the vehicle next. `receive` its HEARTBEAT, EXTENDED_SYS_STATE and COMMAND_ACK; `step` with the time."""
+
+    def __init__(
+        self,
+        send_command: Callable[[int, int, tuple[float, ...]], None],
+        intervals: Sequence[tuple[int, int]],
+        *,
+        land: bool,
+        system_id: int | None = None,
+        report: Callable[[str], None],
+    ) -> None:
+        """`intervals`: (message id, us) to request on connection. `land`: end by landing, else by a forced disarm.
+
+        `system_id`: fly only that vehicle; None: the first autopilot heard.
+        """
+        self._client = CommandClient(send_command)
+        self._intervals = intervals
+        self._land = land
+        self._wanted_system = system_id
+        self._report = report
+        self._to_ask: list[tuple[int, int]] = []
+        self._phase_us = 0
+        self._retry_us = 0
+        self._heartbeat_us = -1
+        self.phase = Phase.SEARCH
+        self.target: tuple[int, int] | None = None
+        self.armed = False
+        self.offboard = False
+        self.landed_state = mavlink.MAV_LANDED_STATE_UNDEFINED
+
+    @property
+    def in_control(self) -> bool:
+        """Flying, and the vehicle follows: a fail-safe or a pilot's mode change takes this away without ending the flight."""
+        return self.phase is Phase.FLY and self.offboard and self.armed
+
+    def accepts(self, system_id: int, component_id: int) -> bool:
+        """Is this sender the vehicle that is flown?"""
+        return self.target == (system_id, component_id)
+
+    def on_heartbeat(self, message: Any, system_id: int, component_id: int, now_us: int) -> None:
+        is_autopilot = message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
+        if not is_autopilot or self._wanted_system not in (None, system_id):
+            return
+        if self.target is None:
+            self.target = (system_id, component_id)
+            self._report(f"vehicle {system_id} found")
+        if self.target != (system_id, component_id):
+            return
+        self._heartbeat_us = now_us
+        self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        self.offboard = message.custom_mode >> 16 & 0xFF == PX4_MAIN_MODE_OFFBOARD
+
+    def on_message(self, message: Any) -> None:
+        """From the vehicle that is flown."""
+        if type(message).id == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
+            self.landed_state = message.landed_state
+        elif type(message).id == mavlink.MAVLINK_MSG_ID_COMMAND_ACK:
+            self._client.receive(message)
+
+    def lose(self, why: str, now_us: int) -> None:
+        """Back to the start: the vehicle fell silent or started anew."""
+        if self.phase in ENDED:
+            return
+        self._report(f"vehicle lost: {why}")
+        self._client.cancel()
+        self.target = None
+        self.armed = self.offboard = False
+        self.landed_state = mavlink.MAV_LANDED_STATE_UNDEFINED
+        self._enter(Phase.SEARCH, now_us)
+
+    def finish(self, now_us: int) -> None:
+        """The flight's time is over."""
+        self._enter(Phase.STOP, now_us)
+
+    def step(self, now_us: int) -> None:
+        if self.target is not None and now_us - self._heartbeat_us > HEARTBEAT_TIMEOUT_US:
+            self.lose(f"no HEARTBEAT for {HEARTBEAT_TIMEOUT_US / 1e6:g} s", now_us)
+        _STEPS[self.phase](self, now_us)
+        self._client.step(now_us)
+
+    def _enter(self, phase: Phase, now_us: int) -> None:
+        self.phase = phase
+        self._phase_us = now_us
+        self._retry_us = 0
+
+    def _search(self, now_us: int) -> None:
+        if self.target is not None:
+            self._to_ask = list(self._intervals)
+            self._enter(Phase.CONNECT, now_us)
+            self._connect(now_us)
+
+    def _connect(self, now_us: int) -> None:
+        if self._client.busy:
+            return
+        if self._to_ask:
+            message_id, interval_us = self._to_ask.pop(0)
+            self._client.start(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us, 0, 0, 0, 0, 0)
+        else:
+            self._enter(Phase.STREAM, now_us)
+
+    def _stream(self, now_us: int) -> None:
+        if now_us - self._phase_us >= STREAM_TIME_US:
+            self._enter(Phase.OFFBOARD, now_us)
+            self._request_offboard(now_us)
+
+    def _request_offboard(self, now_us: int) -> None:
+        if self.offboard:
+            self._client.cancel()
+            self._enter(Phase.ARM, now_us)
+            self._arm(now_us)
+        else:
+            custom = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+            self._ask("OFFBOARD", now_us, mavlink.MAV_CMD_DO_SET_MODE, custom, PX4_MAIN_MODE_OFFBOARD, 0, nan, nan, nan, nan)
+
+    def _arm(self, now_us: int) -> None:
+        if self.armed:
+            self._client.cancel()
+            self._enter(Phase.RELEASE, now_us)
+        elif not self.offboard:
+            self._enter(Phase.OFFBOARD, now_us)
+        else:
+            self._ask("arming", now_us, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, 0, nan, nan, nan, nan, nan)
+
+    def _release(self, now_us: int) -> None:
+        if not self.armed:
+            self._enter(Phase.STREAM, now_us)
+        elif self.landed_state in (mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_TAKEOFF):
+            self._report("flying")
+            self._enter(Phase.FLY, now_us)
+
+    def _fly(self, now_us: int) -> None:
+        if not self.armed:
+            self._report("the vehicle was disarmed in flight")
+            self._enter(Phase.ABORTED, now_us)
+
+    def _stop(self, now_us: int) -> None:
+        if not self.armed:
+            self._client.cancel()
+            self._enter(Phase.DONE, now_us)
+        elif self._land:
+            if self.offboard:
+                self._ask("landing", now_us, mavlink.MAV_CMD_NAV_LAND, nan, nan, nan, nan, nan, nan, nan)
+        else:
+            self._ask("disarming", now_us, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE_DISARM, nan, nan, nan, nan, nan)
+
+    def _nothing(self, now_us: int) -> None:
+        pass
+
+    def _ask(self, what: str, now_us: int, command: int, *params: float) -> None:
+        if self._client.busy or now_us < self._retry_us:
+            return
+        if self._client.result not in (None, mavlink.MAV_RESULT_ACCEPTED):
+            self._report(f"{what} refused (MAV_RESULT {self._client.result}), asking again")
+            self._client.result = None
+            self._retry_us = now_us + RETRY_US
+            return
+        self._retry_us = now_us + RETRY_US
+        self._client.start(command, *params)
+
+
+_STEPS: dict[Phase, Callable[[Handshake, int], None]] = {
+    Phase.SEARCH: Handshake._search,
+    Phase.CONNECT: Handshake._connect,
+    Phase.STREAM: Handshake._stream,
+    Phase.OFFBOARD: Handshake._request_offboard,
+    Phase.ARM: Handshake._arm,
+    Phase.RELEASE: Handshake._release,
+    Phase.FLY: Handshake._fly,
+    Phase.STOP: Handshake._stop,
+    Phase.DONE: Handshake._nothing,
+    Phase.ABORTED: Handshake._nothing,
+}

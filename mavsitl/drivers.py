@@ -1,0 +1,268 @@
+"""Drivers: they move datagrams and time, and decide nothing. In memory, lock-step over UDP, real time over UDP.
+
+In lock-step all frames of one tick travel in one datagram each way, in memory and over UDP alike, so both put the same bytes
+on the wire. The vehicle advances when a setpoint echoes the stamp of its telemetry; a peer that stays silent is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from mavsitl.clock import LatenessHistogram, PacedClock, monotonic_us
+from mavsitl.link.base import Link, LinkError, LinkSilent
+from mavsitl.link.udp import ConnectedUdp
+from mavsitl.log.tlog import Direction, TlogWriter, WireHash
+
+FIRST_REPEAT_S = 0.1
+"""Lock-step: the first datagram is repeated this often until the other side is there."""
+PROGRESS_INTERVAL_US = 100_000
+"""Wall clock between two calls of a progress callback."""
+FLUSH_INTERVAL_US = 1_000_000
+
+
+class Core(Protocol):
+    """A sans-IO end of the link, vehicle or ground: bytes and time in, bytes out."""
+
+    @property
+    def finished(self) -> bool: ...
+    @property
+    def flight_time_s(self) -> float: ...
+    @property
+    def counters(self) -> Any: ...
+    def receive(self, port: int, datagram: bytes) -> int: ...
+    def step(self, now_us: int) -> None: ...
+    def datagrams(self, port: int, *, combine: bool) -> list[bytes]: ...
+
+
+class VehicleCore(Core, Protocol):
+    @property
+    def period_us(self) -> int: ...
+    @property
+    def token_us(self) -> int:
+        """Stamp that the newest setpoint echoes; -1 before the first."""
+
+
+class GroundCore(Core, Protocol):
+    @property
+    def period_us(self) -> int: ...
+    @property
+    def vehicle_time_us(self) -> int:
+        """Stamp of the newest state; -1 before the first."""
+
+
+Progress = Callable[[float], None]
+"""Flight time in seconds, negative before the release."""
+
+
+@dataclass
+class Tap:
+    """What hears every datagram: the digest of the wire, a tlog, and whatever else is to be flushed as time goes."""
+
+    wire: WireHash = field(default_factory=WireHash)
+    tlog: TlogWriter | None = None
+    flush: Callable[[int], None] | None = None
+    _flushed_us: int = 0
+
+    def hear(self, direction: Direction, now_us: int, datagram: bytes) -> None:
+        self.wire.update(direction, datagram)
+        if self.tlog is not None:
+            self.tlog.write(now_us, datagram)
+
+    def tick(self, now_us: int) -> None:
+        if now_us - self._flushed_us >= FLUSH_INTERVAL_US:
+            self._flushed_us = now_us
+            if self.flush is not None:
+                self.flush(now_us)
+            if self.tlog is not None:
+                self.tlog.flush()
+
+
+class _Throttle:
+    """Calls back at most every 0.1 s of wall clock; looking at the clock only every 64th time."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress = progress
+        self._calls = 0
+        self._last_us = -PROGRESS_INTERVAL_US
+
+    def __call__(self, core: Core) -> None:
+        if self._progress is None:
+            return
+        self._calls += 1
+        if self._calls & 63:
+            return
+        now_us = monotonic_us()
+        if now_us - self._last_us >= PROGRESS_INTERVAL_US:
+            self._last_us = now_us
+            self._progress(core.flight_time_s)
+
+
+class LockstepError(LinkError):
+    """The two ends answer one another, but not in step."""
+
+
+def fly_in_memory(
+    vehicle: VehicleCore, ground: GroundCore, tap: Tap | None = None, *, max_time_s: float = 36_000.0, progress: Progress | None = None
+) -> int:
+    """Both ends in this process until both have finished; the microseconds simulated.
+
+    Raises `LockstepError` when the ground stops answering or `max_time_s` is over.
+    """
+    tap = tap or Tap()
+    throttle = _Throttle(progress)
+    now_us, period_us, last_us = 0, vehicle.period_us, int(max_time_s * 1e6)
+    ground_us = 0
+    while True:
+        vehicle.step(now_us)
+        for datagram in vehicle.datagrams(0, combine=True):
+            tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+            ground.receive(0, datagram)
+            ground_us = max(ground_us, ground.vehicle_time_us)
+            ground.step(ground_us)
+            for answer in ground.datagrams(0, combine=True):
+                tap.hear(Direction.FROM_GROUND, now_us, answer)
+                vehicle.receive(0, answer)
+        if vehicle.finished and ground.finished:
+            return now_us
+        if vehicle.token_us < now_us:
+            raise LockstepError(f"the ground did not answer the telemetry stamped {now_us} us")
+        if now_us >= last_us:
+            raise LockstepError(f"the flight did not end within {max_time_s:g} s of simulated time")
+        tap.tick(now_us)
+        throttle(vehicle)
+        now_us += period_us
+
+
+def run_lockstep_vehicle(
+    vehicle: VehicleCore, link: ConnectedUdp, tap: Tap, *, deadline_s: float = 10.0, start_deadline_s: float = 60.0, progress: Progress | None = None
+) -> int:
+    """The vehicle's end, until it has finished; the microseconds simulated. `link` times out after `FIRST_REPEAT_S`.
+
+    Raises `LinkSilent` naming the peer when it is silent for `deadline_s` (`start_deadline_s` before its first answer).
+    """
+    throttle = _Throttle(progress)
+    now_us, period_us = 0, vehicle.period_us
+    repeat = round(1.0 / FIRST_REPEAT_S)
+    while True:
+        vehicle.step(now_us)
+        outbound = vehicle.datagrams(0, combine=True)
+        for datagram in outbound:
+            tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+            link.send(datagram)
+        if vehicle.finished:
+            return now_us
+        patience = round((deadline_s if vehicle.token_us >= 0 else start_deadline_s) * repeat)
+        while vehicle.token_us < now_us:
+            try:
+                answer = link.receive()
+            except LinkSilent as silence:
+                patience -= 1
+                if patience <= 0:
+                    raise LinkSilent(f"lock-step stopped at t = {now_us / 1e6:g} s: {silence}") from silence
+                if vehicle.token_us < 0:
+                    for datagram in outbound:
+                        link.send(datagram)
+                continue
+            tap.hear(Direction.FROM_GROUND, now_us, answer)
+            vehicle.receive(0, answer)
+        tap.tick(now_us)
+        throttle(vehicle)
+        now_us += period_us
+
+
+def run_lockstep_ground(ground: GroundCore, link: ConnectedUdp, tap: Tap, *, deadline_s: float = 10.0, progress: Progress | None = None) -> int:
+    """The ground's end: it answers each datagram of the vehicle, until it has finished; the vehicle's last stamp.
+
+    Raises `LinkSilent` naming the peer when it is silent for `deadline_s`; `link` has a time-out of `FIRST_REPEAT_S`.
+    """
+    throttle = _Throttle(progress)
+    now_us = 0
+    patience = limit = round(deadline_s / FIRST_REPEAT_S)
+    while not ground.finished:
+        try:
+            datagram = link.receive()
+        except LinkSilent as silence:
+            patience -= 1
+            if patience <= 0:
+                raise LinkSilent(f"lock-step stopped at t = {now_us / 1e6:g} s: {silence}") from silence
+            continue
+        patience = limit
+        ground.receive(0, datagram)
+        now_us = max(now_us, ground.vehicle_time_us)
+        tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+        ground.step(now_us)
+        for answer in ground.datagrams(0, combine=True):
+            tap.hear(Direction.FROM_GROUND, now_us, answer)
+            link.send(answer)
+        tap.tick(now_us)
+        throttle(ground)
+    return now_us
+
+
+@dataclass
+class RealTime:
+    """How a real-time run kept its time."""
+
+    real_time_factor: float
+    lateness: LatenessHistogram
+    rebased: int
+    """How often the run was more than a second late and the schedule was moved; simulated time never jumps."""
+
+
+def run_realtime_vehicle(
+    vehicle: VehicleCore,
+    links: Sequence[Link],
+    tap: Tap,
+    *,
+    speed: float = 1.0,
+    until_finished: bool = False,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Progress | None = None,
+) -> RealTime:
+    """The vehicle on the wall clock, times `speed`, with `links` in the order of its ports; peers join by a valid frame."""
+    clock = PacedClock(vehicle.period_us, speed)
+    clock.start()
+    throttle = _Throttle(progress)
+    now_us = 0
+    while not stop() and not (until_finished and vehicle.finished):
+        vehicle.step(now_us)
+        for port, link in enumerate(links):
+            for datagram in vehicle.datagrams(port, combine=False):
+                if port == 0:
+                    tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+                link.send(datagram)
+        clock.wait_until(now_us + vehicle.period_us)
+        for port, link in enumerate(links):
+            for datagram, source in link.receive(now_us):
+                if port == 0:
+                    tap.hear(Direction.FROM_GROUND, now_us, datagram)
+                if vehicle.receive(port, datagram):
+                    link.admit(source, now_us)
+        tap.tick(now_us)
+        throttle(vehicle)
+        now_us += vehicle.period_us
+    return RealTime(clock.real_time_factor, clock.lateness, clock.rebased)
+
+
+def run_realtime_ground(
+    ground: GroundCore, link: Link, tap: Tap, *, stop: Callable[[], bool] = lambda: False, progress: Progress | None = None
+) -> None:
+    """The ground on the wall clock: it steps as soon as telemetry comes, and at least once a control period."""
+    throttle = _Throttle(progress)
+    start_us = monotonic_us()
+    period_s = ground.period_us / 1e6
+    while not stop() and not ground.finished:
+        link.wait(period_s)
+        now_us = monotonic_us() - start_us
+        for datagram, source in link.receive(now_us):
+            tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+            if ground.receive(0, datagram):
+                link.admit(source, now_us)
+        ground.step(now_us)
+        for answer in ground.datagrams(0, combine=False):
+            tap.hear(Direction.FROM_GROUND, now_us, answer)
+            link.send(answer)
+        tap.tick(now_us)
+        throttle(ground)

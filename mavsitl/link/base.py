@@ -1,0 +1,43 @@
+"""What every link offers: datagrams in, datagrams out, never a wait unless asked."""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeAlias
+
+__all__ = ["Link", "LinkError", "LinkSilent", "Source"]
+
+Source: TypeAlias = tuple[str | int, ...]
+"""Where a datagram came from, as the link names it: for UDP the socket address, numeric host and port first."""
+
+
+class LinkError(Exception):
+    """A link cannot be opened or used. The text names the address and what to change."""
+
+
+class LinkSilent(LinkError):
+    """Nothing came within the time allowed."""
+
+
+class Link(Protocol):
+    """A datagram link between one endpoint of ours and its peers.
+
+    The times passed in are microseconds of any clock that does not go back, the same one in every call.
+    """
+
+    def receive(self, now_us: int) -> list[tuple[bytes, Source]]:
+        """What has come, oldest first; empty when nothing has. Does not wait. One call returns a bounded number."""
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until something can be received, at most `timeout_s` seconds; whether there is something."""
+
+    def send(self, datagram: bytes) -> None:
+        """Send to the default remote, if there is one, and to every admitted peer."""
+
+    def admit(self, source: Source, now_us: int) -> bool:
+        """Take `source` for a peer, or keep it one. Only for sources of datagrams that held a valid frame.
+
+        Returns whether it is fed from now on: the number of peers is bounded, and a new one may find no place.
+        """
+
+    def close(self) -> None:
+        """Let go of the link's resources; a second call does nothing. Every other call then raises `LinkError`."""

@@ -1,0 +1,317 @@
+"""MAVLink over UDP: `UdpLink` for many peers without a wait, `ConnectedUdp` for two that take turns."""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+import struct
+import sys
+from typing import Any
+
+from mavsitl.clock import monotonic_us
+from mavsitl.codec import MAX_DATAGRAM_BYTES
+from mavsitl.link.address import Address
+from mavsitl.link.base import LinkError, LinkSilent, Source
+
+__all__ = ["LOOPBACK", "ConnectedUdp", "UdpLink", "open_link"]
+
+LOOPBACK = "127.0.0.1"
+
+MAX_PEERS = 8
+PEER_SILENCE_US = 10_000_000
+"""A peer that has sent nothing valid for so long is fed no more."""
+
+_MAX_RECEIVED = 256  # datagrams in one call, so that a flood cannot hold the caller
+_READ_BYTES = MAX_DATAGRAM_BYTES + 1  # one more than the parser takes: a cut datagram is still seen to be too long
+
+
+def _resolve(host: str, port: int, family: int = socket.AF_UNSPEC) -> tuple[int, Any]:
+    """Address family and numeric socket address."""
+    try:
+        found = socket.getaddrinfo(host, port, family, socket.SOCK_DGRAM)
+    except OSError as error:
+        raise LinkError(f"cannot find the host {host!r}: {error.strerror or error}") from error
+    return int(found[0][0]), found[0][4]
+
+
+def _text(address: Any) -> str:
+    host, port = address[:2]
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def _open(bind: tuple[str, int], family: int, port_option: str, host_option: str) -> socket.socket:
+    """A UDP socket bound to an address that nobody else has."""
+    host, port = bind
+    family, address = _resolve(host, port, family)
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        opened.bind(address)
+    except OSError as error:
+        opened.close()
+        if error.errno == errno.EADDRINUSE:
+            text = f"port {port} is in use (bind {host}): choose another with {port_option}"
+        elif error.errno == errno.EACCES:
+            text = f"port {port} is not allowed for this user (bind {host}): choose one above 1023 with {port_option}"
+        elif error.errno == errno.EADDRNOTAVAIL:
+            text = f"{host} is not an address of this machine (port {port}): choose another with {host_option}"
+        else:
+            text = f"cannot bind {host} port {port}: {error.strerror or error}; see {port_option} and {host_option}"
+        raise LinkError(text) from error
+    return opened
+
+
+class UdpLink:
+    """One socket for both directions. It feeds a default remote, heard or not, and the peers admitted.
+
+    A source becomes a peer by `admit` alone, and never replaces the default remote. Nobody listening at the other side
+    is no error. Unless told otherwise it binds loopback, so no other machine can reach it.
+
+    Attributes:
+        address: the local socket address, with the real port where 0 was asked for.
+        remote: the default remote's socket address, or None.
+        refused: sends that met no listener, where the system reports them (Linux does not for a socket of this kind).
+        send_errors: datagrams not sent to one receiver because the system refused them (buffers full, no route).
+        peers_rejected: admissions refused because every place was taken.
+    """
+
+    def __init__(
+        self,
+        bind: tuple[str, int] = (LOOPBACK, 0),
+        remote: tuple[str, int] | None = None,
+        *,
+        max_peers: int = MAX_PEERS,
+        peer_silence_us: int = PEER_SILENCE_US,
+        port_option: str = "--port ...",
+        host_option: str = "--bind ...",
+    ) -> None:
+        """Bind and resolve. The two options are what an error tells the user to change.
+
+        Raises:
+            LinkError: the port is taken, or a host cannot be found or bound.
+        """
+        family, _ = _resolve(*bind)
+        self.remote: Source | None = None if remote is None else _resolve(*remote, family)[1]
+        self._socket = _open(bind, family, port_option, host_option)
+        self._socket.setblocking(False)
+        self.address: Source = self._socket.getsockname()
+        self.refused = 0
+        self.send_errors = 0
+        self.peers_rejected = 0
+        self._max_peers = max_peers
+        self._peer_silence_us = peer_silence_us
+        self._peers: dict[Source, int] = {}
+        self._closed = False
+
+    @property
+    def peers(self) -> tuple[Source, ...]:
+        """The admitted peers, in the order they came."""
+        return tuple(self._peers)
+
+    def receive(self, now_us: int) -> list[tuple[bytes, Source]]:
+        """What has come, oldest first; drops peers silent for too long. Raises `LinkError` after `close`."""
+        self._check_open()
+        self._expire(now_us)
+        received: list[tuple[bytes, Source]] = []
+        for _ in range(_MAX_RECEIVED):
+            try:
+                received.append(self._socket.recvfrom(_READ_BYTES))
+            except BlockingIOError:
+                break
+            except ConnectionError:
+                self.refused += 1  # the answer to an earlier send: nobody listens there
+            except OSError as error:
+                if error.errno not in (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EMSGSIZE):
+                    raise LinkError(f"cannot receive at {_text(self.address)}: {error.strerror or error}") from error
+                self.refused += 1
+        return received
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until something has come, at most `timeout_s` seconds. Raises `LinkError` after `close`."""
+        self._check_open()
+        readable, _, _ = select.select([self._socket], [], [], timeout_s)
+        return bool(readable)
+
+    def send(self, datagram: bytes) -> None:
+        """Send to the default remote and every peer; one that cannot be reached does not keep it from the others.
+
+        Raises:
+            LinkError: after `close`, or the datagram is longer than UDP carries.
+        """
+        self._check_open()
+        if self.remote is not None:
+            self._send_to(datagram, self.remote)
+        for peer in self._peers:
+            self._send_to(datagram, peer)
+
+    def admit(self, source: Source, now_us: int) -> bool:
+        """Feed `source` until it has been silent too long; whether there was a place for it."""
+        self._check_open()
+        if source == self.remote:
+            return True
+        if source not in self._peers:
+            self._expire(now_us)
+            if len(self._peers) >= self._max_peers:
+                self.peers_rejected += 1
+                return False
+        self._peers[source] = now_us
+        return True
+
+    def close(self) -> None:
+        """Close the socket; a second call does nothing."""
+        self._closed = True
+        self._socket.close()
+
+    def _send_to(self, datagram: bytes, receiver: Source) -> None:
+        try:
+            self._socket.sendto(datagram, receiver)
+        except ConnectionError:
+            # The report belongs to an earlier datagram and this one has not gone: send it again.
+            self.refused += 1
+            try:
+                self._socket.sendto(datagram, receiver)
+            except OSError:
+                self.send_errors += 1
+        except OSError as error:
+            if error.errno == errno.EMSGSIZE:
+                raise LinkError(f"a datagram of {len(datagram)} bytes is too long for {_text(receiver)}") from error
+            self.send_errors += 1
+
+    def _expire(self, now_us: int) -> None:
+        silent = [peer for peer, heard_us in self._peers.items() if now_us - heard_us > self._peer_silence_us]
+        for peer in silent:
+            del self._peers[peer]
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise LinkError(f"the UDP link {_text(self.address)} is closed")
+
+
+class ConnectedUdp:
+    """A blocking socket between two that take turns: the fastest exchange there is between two processes.
+
+    Being connected it takes datagrams from its remote alone. A remote that is not there yet is waited for.
+
+    Attributes:
+        address: the local socket address, with the real port where 0 was asked for.
+        remote: the remote's socket address.
+    """
+
+    def __init__(
+        self,
+        remote: tuple[str, int],
+        bind: tuple[str, int] = (LOOPBACK, 0),
+        *,
+        timeout_s: float = 5.0,
+        port_option: str = "--port ...",
+        host_option: str = "--bind ...",
+    ) -> None:
+        """Bind and connect. `timeout_s` is the longest silence that `receive` bears, above 0.
+
+        Raises:
+            LinkError: the port is taken, or a host cannot be found, bound or routed to.
+        """
+        if not timeout_s >= 1e-6:
+            raise ValueError(f"timeout_s is {timeout_s}; allowed: at least one microsecond")
+        family, _ = _resolve(*bind)
+        self.remote: Source = _resolve(*remote, family)[1]
+        self._socket = _open(bind, family, port_option, host_option)
+        self.address: Source = self._socket.getsockname()
+        self._timeout_s = timeout_s
+        try:
+            self._socket.connect(self.remote)
+        except OSError as error:
+            self._socket.close()
+            raise LinkError(f"no way from {bind[0]} to {_text(self.remote)}: {error.strerror or error}") from error
+        self._set_timeout(timeout_s)
+
+    def receive(self) -> bytes:
+        """The next datagram from the remote.
+
+        Raises:
+            LinkSilent: none came within `timeout_s`.
+            LinkError: the socket failed or is closed.
+        """
+        try:
+            return self._socket.recv(_READ_BYTES)
+        except ConnectionError:
+            return self._receive_after_refusal()
+        except (BlockingIOError, TimeoutError) as error:
+            raise self._silence() from error
+        except OSError as error:
+            raise self._failure("receive", error) from error
+
+    def send(self, datagram: bytes) -> None:
+        """Send to the remote; it is lost without an error when nobody is there yet.
+
+        Raises:
+            LinkError: the socket failed or is closed, or the datagram is longer than UDP carries.
+        """
+        for _ in range(2):
+            try:
+                self._socket.send(datagram)
+                return
+            except ConnectionError:
+                continue  # the report belongs to an earlier datagram and this one has not gone
+            except OSError as error:
+                raise self._failure("send", error) from error
+
+    def close(self) -> None:
+        """Close the socket; a second call does nothing."""
+        self._socket.close()
+
+    def _receive_after_refusal(self) -> bytes:
+        """The wait after "nobody listens there", which would otherwise cut it short."""
+        deadline_us = monotonic_us() + int(self._timeout_s * 1e6)
+        try:
+            while (remaining_us := deadline_us - monotonic_us()) > 0:
+                self._set_timeout(remaining_us * 1e-6)
+                try:
+                    return self._socket.recv(_READ_BYTES)
+                except ConnectionError:
+                    continue
+                except (BlockingIOError, TimeoutError):
+                    break
+            raise self._silence()
+        except OSError as error:
+            raise self._failure("receive", error) from error
+        finally:
+            if self._socket.fileno() >= 0:
+                self._set_timeout(self._timeout_s)
+
+    def _set_timeout(self, timeout_s: float) -> None:
+        if sys.platform == "win32":
+            self._socket.settimeout(timeout_s)
+        else:
+            # The kernel's own limit needs one system call per datagram, Python's needs two.
+            seconds, microseconds = divmod(max(1, round(timeout_s * 1e6)), 1_000_000)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", seconds, microseconds))
+
+    def _silence(self) -> LinkSilent:
+        return LinkSilent(
+            f"nothing came from {_text(self.remote)} to {_text(self.address)} within {self._timeout_s:g} s: "
+            "is the other side running, and does it send there?"
+        )
+
+    def _failure(self, what: str, error: OSError) -> LinkError:
+        return LinkError(f"cannot {what} at {_text(self.address)} ({_text(self.remote)}): {error.strerror or error}")
+
+
+def open_link(address: Address, *, port_option: str = "--port ...", host_option: str = "--bind ...") -> UdpLink:
+    """The link that an endpoint string means: ``udpin`` binds it, ``udpout`` sends to it from a free port.
+
+    The free port is on the one local address from which the remote is reached, not on all of them.
+
+    Raises:
+        LinkError: the address cannot be bound, found or reached.
+    """
+    if address.kind == "udpin":
+        return UdpLink((address.host, address.port), port_option=port_option, host_option=host_option)
+    family, remote = _resolve(address.host, address.port)
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(remote)  # sends nothing: it only asks the routing table
+        except OSError as error:
+            raise LinkError(f"no way to {_text(remote)}: {error.strerror or error}") from error
+        local_host = str(probe.getsockname()[0])
+    return UdpLink((local_host, 0), remote[:2], port_option=port_option, host_option=host_option)

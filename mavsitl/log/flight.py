@@ -1,0 +1,215 @@
+"""One flight as arrays in the paper's frame, joined from the vehicle's log and the ground's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from mavsitl import frames
+from mavsitl.log import topics
+from mavsitl.log.topics import Topic
+from mavsitl.log.ulog import MemoryRecorder, read
+
+Array: TypeAlias = npt.NDArray[np.float64]
+Tables: TypeAlias = Mapping[str, Mapping[str, npt.NDArray[Any]]]
+
+VEHICLE_LOG = "vehicle.ulg"
+GROUND_LOG = "ground.ulg"
+
+
+class FlightError(ValueError):
+    """The logs hold no flight; the message says what is missing."""
+
+
+@dataclass(frozen=True)
+class LinkStatistics:
+    """The ground's end of the link: running counts of frames since its start, and the age of the state it used."""
+
+    received: Array
+    """(k,)"""
+    lost: Array
+    """(k,)"""
+    bad: Array
+    """(k,)"""
+    state_age_ms: Array
+    """(k,)"""
+
+
+@dataclass(frozen=True, eq=False)
+class FlightData:
+    """k samples from the release on; world NWU, body FLU, Euler angles Z-Y-X as phi, theta, psi.
+
+    What the other side or a rarer topic tells is the last row at or before the sample's time, NaN before the first.
+    """
+
+    time_s: Array
+    """(k,) from the release."""
+    position_nwu_m: Array
+    """(k, 3) truth."""
+    position_reference_nwu_m: Array
+    """(k, 3)"""
+    velocity_nwu_m_s: Array
+    """(k, 3) truth."""
+    attitude_deg: Array
+    """(k, 3) truth."""
+    attitude_reference_deg: Array
+    """(k, 3) the commanded angles."""
+    wind_nwu_m_s: Array
+    """(k, 3) truth; 0 without a wind topic."""
+    rotor_speed_rad_s: Array | None
+    """(k, 4)"""
+    weights: Array | None
+    """(k, 3, 3): net (roll, pitch, yaw), output weight (P, I, D)."""
+    demand: Array | None
+    """(k, 4): U_1..U_4 in N, N, N, N m."""
+    link: LinkStatistics | None
+    saturated_share: float | None
+    """Share of the samples with a rotor at its limit, 0 to 1."""
+
+    @classmethod
+    def from_recorders(
+        cls, vehicle: MemoryRecorder, ground: MemoryRecorder, *, duration_s: float | None = None
+    ) -> FlightData:
+        """From what the two ends recorded in memory. See `from_tables`."""
+        return cls.from_tables(vehicle.tables(), ground.tables(), duration_s=duration_s)
+
+    @classmethod
+    def from_folder(cls, folder: Path, *, duration_s: float | None = None) -> FlightData:
+        """From `vehicle.ulg` and `ground.ulg` in a folder. Raises `LogError` for a file, else as `from_tables`."""
+        vehicle, ground = read(folder / VEHICLE_LOG), read(folder / GROUND_LOG)
+        try:
+            return cls.from_tables(vehicle, ground, duration_s=duration_s)
+        except FlightError as error:
+            raise FlightError(f"{folder}: {error}") from error
+
+    @classmethod
+    def from_tables(cls, vehicle: Tables, ground: Tables, *, duration_s: float | None = None) -> FlightData:
+        """Join on equal timestamps, which both ends write in the vehicle's clock; from the release to the end.
+
+        The release is the first `vehicle_land_detected` row with landed = 0. With `duration_s` the flight is
+        cut that long after it. Raises `FlightError` when there was no release, a needed topic is missing or no
+        timestamps are equal.
+        """
+        position, attitude = _need(vehicle, topics.LOCAL_POSITION_TRUTH), _need(vehicle, topics.ATTITUDE_TRUTH)
+        reference, commanded = _need(ground, topics.TRAJECTORY_SETPOINT), _need(ground, topics.ATTITUDE_SETPOINT)
+        stamps = position["timestamp"]
+        for table in (attitude, reference, commanded):
+            stamps = np.intersect1d(stamps, table["timestamp"])
+        release_us = _release_us(vehicle)
+        stamps = stamps[stamps >= release_us]
+        if duration_s is not None:
+            stamps = stamps[stamps <= release_us + round(duration_s * 1e6)]
+        if not stamps.size:
+            raise FlightError("vehicle and ground have no equal timestamp after the release")
+
+        def equal(table: Mapping[str, npt.NDArray[Any]], *columns: str) -> Any:
+            rows = np.searchsorted(table["timestamp"], stamps)
+            return np.column_stack([table[column][rows].astype(np.float64) for column in columns])
+
+        def held(tables: Tables, topic: Topic, *columns: str) -> Any:
+            return _held(tables, topic, stamps, columns)
+
+        wind = held(vehicle, topics.WIND_TRUTH, "windspeed_north", "windspeed_east", "windspeed_down")
+        link = held(ground, topics.LINK_STATUS, "received", "lost", "bad", "state_age_us")
+        weights = held(ground, topics.PIDNN_WEIGHTS, "roll", "pitch", "yaw")
+        saturated = held(vehicle, topics.ROTOR_STATUS, "saturated")
+        return cls(
+            time_s=(stamps - np.uint64(release_us)).astype(np.float64) * 1e-6,
+            position_nwu_m=_vector(equal(position, "x", "y", "z")),
+            position_reference_nwu_m=_vector(equal(reference, "position")),
+            velocity_nwu_m_s=_vector(equal(position, "vx", "vy", "vz")),
+            attitude_deg=_euler_deg(equal(attitude, "q")),
+            attitude_reference_deg=_flipped_euler_deg(equal(commanded, "roll_body", "pitch_body", "yaw_body")),
+            wind_nwu_m_s=np.zeros((stamps.size, 3)) if wind is None else _vector(wind),
+            rotor_speed_rad_s=held(vehicle, topics.ROTOR_STATUS, "speed_rad_s"),
+            weights=None if weights is None else weights.reshape(-1, 3, 3),
+            demand=held(ground, topics.CONTROL_DEMAND, "u"),
+            link=None if link is None else LinkStatistics(link[:, 0], link[:, 1], link[:, 2], link[:, 3] * 1e-3),
+            saturated_share=None if saturated is None else _share(saturated[:, 0]),
+        )
+
+    @property
+    def has_wind(self) -> bool:
+        return bool(np.any(np.nan_to_num(self.wind_nwu_m_s) != 0.0))
+
+    def attitude_error_deg(self) -> Array:
+        """(k, 3) angle minus commanded angle, in [-180, 180)."""
+        error: Array = (self.attitude_deg - self.attitude_reference_deg + 180.0) % 360.0 - 180.0
+        return error
+
+    def position_error_nwu_m(self) -> Array:
+        """(k, 3) position minus reference."""
+        return self.position_nwu_m - self.position_reference_nwu_m
+
+
+def _need(tables: Tables, topic: Topic) -> Mapping[str, npt.NDArray[Any]]:
+    table = tables.get(topic.name)
+    if table is None:
+        raise FlightError(f"no {topic.name} was logged")
+    return table
+
+
+def _release_us(vehicle: Tables) -> int:
+    table = _need(vehicle, topics.LAND_DETECTED)
+    airborne = np.flatnonzero(table["landed"] == 0)
+    if not airborne.size:
+        raise FlightError(f"the vehicle was never released: no {topics.LAND_DETECTED.name} with landed = 0")
+    return int(table["timestamp"][airborne[0]])
+
+
+def _held(tables: Tables, topic: Topic, stamps: npt.NDArray[Any], columns: tuple[str, ...]) -> Any:
+    """(k, columns) of the last row at or before each stamp; None when the topic was not logged."""
+    table = tables.get(topic.name)
+    if table is None:
+        return None
+    rows = np.searchsorted(table["timestamp"], stamps, side="right") - 1
+    values = np.column_stack([table[column].astype(np.float64) for column in columns])[rows]
+    values[rows < 0] = np.nan
+    return values
+
+
+def _share(flags: Array) -> float | None:
+    known = flags[~np.isnan(flags)]
+    return float(np.mean(known != 0.0)) if known.size else None
+
+
+# The functions of `frames` are sign flips, so they take columns as well as numbers.
+
+
+def _vector(ned: Any) -> Array:
+    columns: Array = np.column_stack(frames.flip_vector(ned[:, 0], ned[:, 1], ned[:, 2]))
+    return columns
+
+
+def _flipped_euler_deg(angles_rad: Any) -> Array:
+    flipped = frames.flip_euler(angles_rad[:, 0], angles_rad[:, 1], angles_rad[:, 2])
+    angles: Array = np.degrees(np.column_stack(flipped))
+    return angles
+
+
+def _euler_deg(quaternion_ned: Any) -> Array:
+    """Z-Y-X angles of (k, 4) attitudes FRD -> NED, as those of FLU -> NWU."""
+    w, x, y, z = (np.asarray(c) for c in frames.flip_quaternion(*(quaternion_ned[:, i] for i in range(4))))
+    phi = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    theta = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    psi = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    angles: Array = np.degrees(np.column_stack((phi, theta, psi)))
+    return angles
+
+
+def equal(one: FlightData, other: FlightData) -> bool:
+    """Whether two flights hold the same numbers, NaN equal to NaN."""
+
+    def same(a: object, b: object) -> bool:
+        if isinstance(a, LinkStatistics) and isinstance(b, LinkStatistics):
+            return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+        if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+            return np.array_equal(a, b, equal_nan=True)
+        return a == b
+
+    return all(same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))

@@ -1,0 +1,115 @@
+"""The wire on record: a tlog that ground stations replay, and a digest of every byte that crossed."""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from hashlib import blake2b
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from mavsitl.log.ulog import LogError
+
+_STAMP = struct.Struct(">Q")
+_PREFIX = struct.Struct("<BI")
+_MAVLINK_1 = 0xFE
+_MAVLINK_2 = 0xFD
+_SIGNED = 0x01
+
+
+class Direction(IntEnum):
+    """Who sent it. The value is the byte that `WireHash` takes in."""
+
+    FROM_VEHICLE = 0
+    FROM_GROUND = 1
+
+
+def frames(datagram: bytes) -> list[bytes]:
+    """The MAVLink 1 and 2 frames of a datagram, split by their length fields; bytes of no frame are left out.
+
+    Checksums are not looked at: the record holds what was on the wire.
+    """
+    found = []
+    at = 0
+    size = len(datagram)
+    while at < size:
+        magic = datagram[at]
+        if magic == _MAVLINK_2 and at + 3 <= size:
+            length = 12 + datagram[at + 1] + (13 if datagram[at + 2] & _SIGNED else 0)
+        elif magic == _MAVLINK_1 and at + 2 <= size:
+            length = 8 + datagram[at + 1]
+        else:
+            at += 1
+            continue
+        if at + length > size:
+            at += 1
+            continue
+        found.append(datagram[at : at + length])
+        at += length
+    return found
+
+
+class TlogWriter:
+    """Writes a .tlog: before each frame its time in us, 8 bytes, big-endian. Raises `LogError` as `UlogWriter` does."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.left_out_bytes = 0
+        """Bytes of datagrams that belonged to no frame and so are not in the file."""
+        try:
+            self._file: BinaryIO = path.open("wb")
+        except OSError as error:
+            raise self._error(error) from error
+
+    def write(self, timestamp_us: int, datagram: bytes) -> None:
+        """Append the frames of one datagram, sent by either side at `timestamp_us`."""
+        stamp = _STAMP.pack(timestamp_us)
+        split = frames(datagram)
+        self.left_out_bytes += len(datagram) - sum(map(len, split))
+        try:
+            self._file.write(b"".join(part for frame in split for part in (stamp, frame)))
+        except OSError as error:
+            raise self._error(error) from error
+
+    def flush(self) -> None:
+        """Hand everything written so far to the system."""
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise self._error(error) from error
+
+    def close(self) -> None:
+        """More than once is harmless."""
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._error(error) from error
+
+    def __enter__(self) -> TlogWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _error(self, error: OSError) -> LogError:
+        return LogError(f"{self.path}: cannot be written: {error.strerror or error}")
+
+
+class WireHash:
+    """A running blake2b over (direction byte, uint32 length, datagram): runs that agree exchanged the same bytes."""
+
+    __slots__ = ("_hash",)
+
+    def __init__(self) -> None:
+        self._hash = blake2b(digest_size=16)
+
+    def update(self, direction: Direction, datagram: bytes) -> None:
+        self._hash.update(_PREFIX.pack(direction, len(datagram)))
+        self._hash.update(datagram)
+
+    def hexdigest(self) -> str:
+        """32 hexadecimal digits, of everything so far."""
+        return self._hash.hexdigest()

@@ -1,0 +1,285 @@
+"""Recorders: rows of topics into memory or into a ULog file, both packed alike, so that both give equal numbers.
+
+ULog is PX4's log format (docs.px4.io, "ULog File Format"): definitions, then messages with a 3-byte header each.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable, Mapping
+from io import FileIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from mavsitl.log.topics import DATA_MESSAGE, TOPICS, Topic
+
+MAGIC = b"ULog\x01\x12\x35\x01"
+FLUSH_PERIOD_US = 1_000_000
+_BUFFER_BYTES = 1 << 18
+_TEXT_BYTES = 4096
+_FLOAT_MAX = float(np.finfo(np.float32).max)
+
+
+class LogError(OSError):
+    """A log cannot be written or read; the message names the file and the reason."""
+
+
+class _Sink:
+    """A preallocated buffer and how much of it is filled."""
+
+    __slots__ = ("buffer", "capacity", "offset")
+
+    def __init__(self, capacity: int) -> None:
+        self.buffer = bytearray(capacity)
+        self.capacity = capacity
+        self.offset = 0
+
+    def make_room(self, size: int) -> None:
+        """Called when `size` more bytes do not fit: grow."""
+        self.capacity = max(2 * self.capacity, self.offset + size)
+        grown = bytearray(self.capacity)
+        grown[: self.offset] = self.buffer[: self.offset]
+        self.buffer = grown
+
+
+class Rows:
+    """Where one topic's rows go. Packs straight into the buffer: no object is kept per row."""
+
+    __slots__ = ("_body", "_id", "_pack_into", "_sink", "_size", "topic")
+
+    def __init__(self, topic: Topic, message_id: int, sink: _Sink) -> None:
+        self.topic = topic
+        self._id = message_id
+        self._sink = sink
+        self._size = topic.message.size
+        self._body = self._size - 3
+        self._pack_into = topic.message.pack_into
+
+    def append(self, timestamp_us: int, *values: float) -> None:
+        """One row; `values` are the topic's fields, arrays flat. A float beyond float32's range is logged as infinite.
+
+        Raises struct.error for a wrong number of values, or for an integer out of range, and `LogError` when the
+        buffer is full and the file cannot be written.
+        """
+        sink = self._sink
+        size = self._size
+        if sink.offset + size > sink.capacity:
+            sink.make_room(size)
+        offset = sink.offset
+        try:
+            self._pack_into(sink.buffer, offset, self._body, DATA_MESSAGE, self._id, timestamp_us, *values)
+        except OverflowError:
+            limited = [math.copysign(math.inf, v) if abs(v) > _FLOAT_MAX else v for v in values]
+            self._pack_into(sink.buffer, offset, self._body, DATA_MESSAGE, self._id, timestamp_us, *limited)
+        sink.offset = offset + size
+
+
+class Recorder(Protocol):
+    """What a wing logs to."""
+
+    def topic(self, topic: Topic) -> Rows:
+        """The rows of `topic`; the same object each time."""
+
+    def message(self, timestamp_us: int, level: int, text: str) -> None:
+        """A line of text; `level` is MAV_SEVERITY, 0 (emergency) to 7 (debug)."""
+
+
+class MemoryRecorder:
+    """Keeps everything in memory."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, tuple[Rows, _Sink]] = {}
+        self.messages: list[tuple[int, int, str]] = []
+        """(timestamp us, level, text)"""
+
+    def topic(self, topic: Topic) -> Rows:
+        known = self._rows.get(topic.name)
+        if known is None:
+            sink = _Sink(4096 * topic.message.size)
+            known = self._rows[topic.name] = (Rows(topic, len(self._rows), sink), sink)
+        elif known[0].topic != topic:
+            raise ValueError(f"{topic.name}: recorded already with other fields")
+        return known[0]
+
+    def message(self, timestamp_us: int, level: int, text: str) -> None:
+        self.messages.append((timestamp_us, level, text))
+
+    def arrays(self, topic: Topic) -> dict[str, npt.NDArray[Any]]:
+        """A copy of the columns, scalars (k,), arrays (k, length), in the log's own types; k = 0 if never written."""
+        rows, sink = self._rows.get(topic.name, (None, _Sink(0)))
+        if rows is not None and rows.topic != topic:
+            raise ValueError(f"{topic.name}: recorded with other fields")
+        return topic.arrays(sink.buffer, sink.offset // topic.message.size)
+
+    def tables(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
+        """Every topic that has rows, as `read` gives it."""
+        return {name: self.arrays(rows.topic) for name, (rows, sink) in self._rows.items() if sink.offset}
+
+
+class _FileSink(_Sink):
+    """Drains into a file when full. Whole messages only, so what is on disk is always readable."""
+
+    __slots__ = ("_file", "_path")
+
+    def __init__(self, path: Path, capacity: int) -> None:
+        super().__init__(capacity)
+        self._path = path
+        try:
+            self._file: FileIO | None = path.open("wb", buffering=0)
+        except OSError as error:
+            raise _write_error(path, error) from error
+
+    def write(self, data: bytes) -> None:
+        size = len(data)
+        if self.offset + size > self.capacity:
+            self.make_room(size)
+        self.buffer[self.offset : self.offset + size] = data
+        self.offset += size
+
+    def make_room(self, size: int) -> None:
+        self.drain()
+        if size > self.capacity:
+            super().make_room(size)
+
+    def drain(self) -> None:
+        """Raises `LogError`, and then closes the file: what comes after a torn message would not be readable."""
+        file = self._file
+        if file is None:
+            raise LogError(f"{self._path}: cannot be written: it is closed")
+        written = 0
+        try:
+            with memoryview(self.buffer) as view:
+                while written < self.offset:
+                    written += file.write(view[written : self.offset])
+        except OSError as error:
+            self._file = None
+            file.close()
+            raise _write_error(self._path, error) from error
+        self.offset = 0
+
+    def close(self) -> None:
+        if self._file is None:
+            return
+        self.drain()
+        file, self._file = self._file, None
+        try:
+            file.close()
+        except OSError as error:
+            raise _write_error(self._path, error) from error
+
+
+class UlogWriter:
+    """Writes a ULog file: definitions and subscriptions at once, then rows in the order in which they came.
+
+    `info` holds strings (PX4's keys: sys_name, ver_sw, ...); `parameters` are logged as float, an int value as int32_t;
+    `topics` are those that may be asked for. Raises `LogError` when the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        info: Mapping[str, str],
+        parameters: Mapping[str, float],
+        *,
+        topics: Iterable[Topic] = TOPICS,
+        start_us: int = 0,
+    ) -> None:
+        self.path = path
+        asked = tuple(topics)
+        self._flushed_us = start_us
+        parts = [MAGIC + struct.pack("<Q", start_us), _message("B", bytes(40))]
+        parts += [_message("F", topic.ulog_format.encode("ascii")) for topic in asked]
+        for key, text in info.items():
+            value = text.encode("utf-8")
+            parts.append(_message("I", _keyed(f"char[{len(value)}] {key}", value)))
+        for key, number in parameters.items():
+            if isinstance(number, int):
+                parts.append(_message("P", _keyed(f"int32_t {key}", struct.pack("<i", number))))
+            else:
+                parts.append(_message("P", _keyed(f"float {key}", struct.pack("<f", number))))
+        for message_id, topic in enumerate(asked):
+            parts.append(_message("A", struct.pack("<BH", 0, message_id) + topic.name.encode("ascii")))
+        self._sink = _FileSink(path, _BUFFER_BYTES)
+        self._rows = {topic.name: Rows(topic, message_id, self._sink) for message_id, topic in enumerate(asked)}
+        self._sink.write(b"".join(parts))
+        self._sink.drain()
+
+    def topic(self, topic: Topic) -> Rows:
+        rows = self._rows.get(topic.name)
+        if rows is None or rows.topic != topic:
+            raise ValueError(f"{topic.name}: not among the topics that this file was opened with")
+        return rows
+
+    def message(self, timestamp_us: int, level: int, text: str) -> None:
+        if not 0 <= level <= 7:
+            raise ValueError(f"level {level}: 0 (emergency) to 7 (debug) is allowed")
+        body = text.encode("utf-8")[:_TEXT_BYTES].decode("utf-8", "ignore").encode("utf-8")
+        self._sink.write(_message("L", struct.pack("<BQ", ord("0") + level, timestamp_us) + body))
+
+    def flush(self, now_us: int) -> None:
+        """Hand the rows to the system once per simulated second, so that a killed process leaves a readable file."""
+        if now_us - self._flushed_us >= FLUSH_PERIOD_US:
+            self._flushed_us = now_us
+            self._sink.drain()
+
+    def close(self) -> None:
+        """Write what is left. More than once is harmless."""
+        self._sink.close()
+
+    def __enter__(self) -> UlogWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def read(path: Path) -> dict[str, dict[str, npt.NDArray[Any]]]:
+    """Topic name -> column -> values: scalars (k,), array fields (k, length), as in `MemoryRecorder.tables`.
+
+    Topics without rows are left out. A file that was cut off is read up to the cut. Raises `LogError`.
+    """
+    from pyulog.core import ULog, ULogException
+
+    try:
+        with path.open("rb") as file:
+            log = ULog(file, disable_str_exceptions=False)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (ULogException, UnicodeDecodeError) as error:
+        raise LogError(f"{path}: not a ULog file: {error}") from error
+    if log.file_corruption:
+        raise LogError(f"{path}: damaged: a message in it is not valid ULog")
+    return {dataset.name: _columns(dataset.data) for dataset in log.data_list}
+
+
+def _columns(flat: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """pyulog's ``q[0]``, ``q[1]``, ... put together as ``q`` (k, length)."""
+    grouped: dict[str, list[npt.NDArray[Any]]] = {}
+    scalars: dict[str, npt.NDArray[Any]] = {}
+    for name, values in flat.items():
+        base, bracket, _ = name.partition("[")
+        if bracket:
+            grouped.setdefault(base, []).append(values)
+        else:
+            scalars[name] = values
+    return scalars | {name: np.stack(columns, axis=1) for name, columns in grouped.items()}
+
+
+def _message(kind: str, body: bytes) -> bytes:
+    return struct.pack("<HB", len(body), ord(kind)) + body
+
+
+def _keyed(declaration: str, value: bytes) -> bytes:
+    key = declaration.encode("ascii")
+    return bytes([len(key)]) + key + value
+
+
+def _write_error(path: Path, error: OSError) -> LogError:
+    return LogError(f"{path}: cannot be written: {error.strerror or error}")

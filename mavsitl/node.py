@@ -1,0 +1,167 @@
+"""One MAVLink endpoint on one link, without I/O: datagrams in, frames out; messages in, datagrams out.
+
+It numbers what it sends, counts what it gets, knows its peers' losses and tells which frames are meant for it. A second
+link of the same component gets a node of its own: sequence numbers count per link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mavsitl.codec import Counters, Frame, Message, Packer, encode, parse
+
+__all__ = ["DATAGRAM_BYTES", "MAX_SOURCES", "Node", "SourceStatistics"]
+
+DATAGRAM_BYTES = 1400
+"""Combined datagrams end here: an Ethernet packet's 1500 bytes less IP and UDP headers and room for a tunnel."""
+
+MAX_SOURCES = 64
+"""Sources whose losses are followed; above it the one not heard for longest gives way."""
+
+_LATE = 128  # a step of half the sequence's circle or more is a step back
+_LATE_RUN = 8  # so many steps back in a row are a sender that began anew
+
+
+@dataclass(slots=True)
+class SourceStatistics:
+    """What came from one (system id, component id), by its sequence numbers."""
+
+    sequence: int
+    """the newest sequence number seen"""
+    received: int = 1
+    lost: int = 0
+    """numbers skipped and not seen since"""
+    late: int = 0
+    """frames that came after a newer one, or twice"""
+    restarts: int = 0
+    """times the sender began to count anew"""
+    heard: int = 0
+    """the node's count of frames when this source was last heard"""
+    late_run: int = 0
+
+    @property
+    def loss(self) -> float:
+        """Share of the frames sent that never came, 0 to 1."""
+        return self.lost / (self.received + self.lost)
+
+    def update(self, sequence: int) -> None:
+        """Take in the sequence number of one more frame."""
+        self.received += 1
+        step = (sequence - self.sequence) & 0xFF
+        if 0 < step < _LATE:
+            self.lost += step - 1
+            self.sequence = sequence
+            self.late_run = 0
+            return
+        self.late += 1
+        self.late_run += 1
+        if self.late_run >= _LATE_RUN:
+            self.restarts += 1
+            self.sequence = sequence
+            self.late_run = 0
+        elif step and self.lost:
+            self.lost -= 1
+
+
+class Node:
+    """A MAVLink endpoint: `send` and `datagrams` outwards, `receive` inwards.
+
+    Attributes:
+        system_id, component_id: its own address, 1 to 255 each.
+        counters: what became of the input, see `mavsitl.codec.Counters`.
+        own_frames: frames dropped because they carry the node's own address (an echo).
+        sources: statistics by (system id, component id), at most `MAX_SOURCES`.
+    """
+
+    def __init__(self, system_id: int, component_id: int) -> None:
+        for name, value in (("system_id", system_id), ("component_id", component_id)):
+            if not 1 <= value <= 255:
+                raise ValueError(f"{name} is {value}; allowed: 1 to 255")
+        self.system_id = system_id
+        self.component_id = component_id
+        self.counters = Counters()
+        self.own_frames = 0
+        self.sources: dict[tuple[int, int], SourceStatistics] = {}
+        self._sequence = 0
+        self._frames_heard = 0
+        self._outbox: list[bytes] = []
+
+    def send(self, pack: Packer, *fields: object) -> None:
+        """Queue one frame: `pack` is a function that `mavsitl.codec.packer` made, `fields` are its fields.
+
+        Raises:
+            EncodeError: the fields do not fit; nothing is queued and no sequence number used.
+        """
+        self._outbox.append(pack(self._sequence, self.system_id, self.component_id, *fields))
+        self._sequence = (self._sequence + 1) & 0xFF
+
+    def send_message(self, message: Message) -> None:
+        """Queue one message object. Raises `EncodeError` as `send` does."""
+        self._outbox.append(encode(message, self._sequence, self.system_id, self.component_id))
+        self._sequence = (self._sequence + 1) & 0xFF
+
+    def datagrams(self, max_bytes: int = DATAGRAM_BYTES, combine: bool = False) -> list[bytes]:
+        """Take the queued frames as datagrams, in order.
+
+        Args:
+            max_bytes: length of the longest combined datagram; a single longer frame still goes, alone.
+            combine: put as many frames into a datagram as fit, instead of one frame each, which is what PX4 does.
+        """
+        frames, self._outbox = self._outbox, []
+        if not combine:
+            return frames
+        datagrams: list[bytes] = []
+        first = 0
+        length = 0
+        for index, frame in enumerate(frames):
+            if length and length + len(frame) > max_bytes:
+                datagrams.append(b"".join(frames[first:index]))
+                first = index
+                length = 0
+            length += len(frame)
+        if length:
+            datagrams.append(b"".join(frames[first:]))
+        return datagrams
+
+    def receive(self, datagram: bytes) -> list[Frame]:
+        """The good frames of one datagram, the node's own left out, whomever they are meant for; never raises."""
+        frames = parse(datagram, self.counters)
+        own = False
+        for frame in frames:
+            if frame.system_id == self.system_id and frame.component_id == self.component_id:
+                own = True
+            else:
+                self._note(frame)
+        if own:
+            others = [frame for frame in frames if (frame.system_id, frame.component_id) != self.address]
+            self.own_frames += len(frames) - len(others)
+            return others
+        return frames
+
+    @property
+    def address(self) -> tuple[int, int]:
+        """(system id, component id)."""
+        return self.system_id, self.component_id
+
+    def addressed_to(self, frame: Frame) -> bool:
+        """Whether a frame is meant for this node: by target system and component, 0 being everybody.
+
+        A message without target fields is meant for everybody.
+        """
+        message = frame.message
+        target_system = getattr(message, "target_system", 0)
+        if target_system not in (0, self.system_id):
+            return False
+        return getattr(message, "target_component", 0) in (0, self.component_id)
+
+    def _note(self, frame: Frame) -> None:
+        key = (frame.system_id, frame.component_id)
+        source = self.sources.get(key)
+        if source is None:
+            if len(self.sources) >= MAX_SOURCES:
+                del self.sources[min(self.sources, key=lambda known: self.sources[known].heard)]
+            source = self.sources[key] = SourceStatistics(frame.sequence)
+        else:
+            source.update(frame.sequence)
+        self._frames_heard += 1
+        source.heard = self._frames_heard

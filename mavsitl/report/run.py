@@ -1,0 +1,120 @@
+"""A run's folder: `run.json` beside one folder for each flight."""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+import mavsitl
+from mavsitl.report.metrics import PAPER_TABLES, paper_case
+from mavsitl.scenario import Flight
+
+RUN_FILE = "run.json"
+
+
+class RunError(ValueError):
+    """A run's folder is not as it should be; the message names the file and what was expected."""
+
+
+class FlightRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What was flown. `folder` is relative to the run's and holds `vehicle.ulg` and `ground.ulg`."""
+
+    name: str
+    title: str
+    folder: str
+    seed: int
+    airframe: str
+    level: str
+    law: str
+    wind_information: str
+    wire_hash: str
+    real_time_factor: Annotated[float, msgspec.Meta(ge=0.0)] | None
+    """Simulated over wall-clock time; None where it was not measured."""
+    scenario_digest: str
+    duration_s: Annotated[float, msgspec.Meta(gt=0.0)]
+    paper_case: str | None = None
+    """The key of `PAPER_TABLES` that the flight answers to."""
+    wind: tuple[str, ...] = ()
+    """Wind models; empty in calm air."""
+
+
+class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    version: str
+    command: str
+    created_utc: str
+    flights: tuple[FlightRecord, ...]
+
+
+def new_run(command: str, created_utc: str, flights: tuple[FlightRecord, ...]) -> Run:
+    """A run of this version of mavsitl; `created_utc` is text (ISO 8601), the caller having the clock."""
+    return Run(version=mavsitl.__version__, command=command, created_utc=created_utc, flights=flights)
+
+
+def record(flight: Flight, *, folder: str, wire_hash: str, real_time_factor: float | None) -> FlightRecord:
+    """What `run.json` says of a flight."""
+    scenario = flight.scenario
+    return FlightRecord(
+        name=flight.name,
+        title=scenario.title,
+        folder=folder,
+        seed=scenario.seed,
+        airframe=scenario.airframe,
+        level=scenario.controller.level,
+        law=scenario.controller.law,
+        wind_information=scenario.controller.wind_information,
+        wire_hash=wire_hash,
+        real_time_factor=real_time_factor,
+        scenario_digest=scenario_digest(flight),
+        duration_s=scenario.duration_s,
+        paper_case=paper_case(scenario),
+        wind=tuple(str(model.__struct_config__.tag) for model in scenario.wind),
+    )
+
+
+def scenario_digest(flight: Flight) -> str:
+    """16 hexadecimal digits of the scenario with its airframe, defaults filled in, whatever the file is called."""
+    text = msgspec.json.encode((flight.scenario, flight.airframe), order="deterministic")
+    return blake2b(text, digest_size=8).hexdigest()
+
+
+def write_run(folder: Path, run: Run) -> Path:
+    """Write `run.json` whole or not at all, making the folder. Raises `RunError`."""
+    path = folder / RUN_FILE
+    new = folder / f"{RUN_FILE}.new"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        new.write_bytes(msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
+        new.replace(path)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return path
+
+
+def load_run(folder: Path) -> Run:
+    """Read `run.json`. Raises `RunError` for a missing or damaged file and for a flight folder that leads elsewhere."""
+    path = folder / RUN_FILE
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise RunError(f"{path}: not found; expected the folder of a run, with {RUN_FILE} in it") from error
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror or error}") from error
+    try:
+        run = msgspec.json.decode(data, type=Run)
+    except msgspec.ValidationError as error:
+        raise RunError(f"{path}: not a run of mavsitl {mavsitl.__version__}: {error}") from error
+    except msgspec.DecodeError as error:
+        raise RunError(f"{path}: damaged, expected JSON: {error}") from error
+    for flight in run.flights:
+        inside = (folder / flight.folder).resolve()
+        if not inside.is_relative_to(folder.resolve()):
+            raise RunError(f"{path}: flight {flight.name}: folder {flight.folder!r} is outside the run's folder")
+        if not inside.is_dir():
+            raise RunError(f"{path}: flight {flight.name}: no folder {flight.folder!r}; expected one beside {RUN_FILE}")
+        if flight.paper_case is not None and flight.paper_case not in PAPER_TABLES:
+            allowed = ", ".join(PAPER_TABLES)
+            raise RunError(f"{path}: flight {flight.name}: paper_case {flight.paper_case!r} is not one of {allowed}")
+    return run

@@ -1,0 +1,1 @@
+"""The laws, equation by equation."""

@@ -1,0 +1,120 @@
+"""The physical side of the vehicle wing: n vehicles' plant, wind, sensors and inner loops, advanced a tick at a time."""
+
+from __future__ import annotations
+
+from math import nan, radians
+
+import numpy as np
+
+from mavsitl import seeds
+from mavsitl.scenario import Flight
+from mavsitl_vehicle import tick
+from mavsitl_vehicle.autopilot.parameters import Parameters
+from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint
+from mavsitl_vehicle.plant.parameters import plant_parameters
+from mavsitl_vehicle.plant.state import initial_state
+from mavsitl_vehicle.wind.field import WindField
+
+BLOCK_TICKS = 250
+"""Normals are drawn for this many ticks at once."""
+
+SATURATED_MASK = 0xFF
+
+
+class Simulation:
+    """Arrays have the fleet axis last. `x` (17, n) is the truth, `estimate` (13, n) what the sensors say, `wind` (3, n)."""
+
+    def __init__(self, flight: Flight, parameters: Parameters, seed: int, n: int = 1) -> None:
+        scenario, airframe = flight.scenario, flight.airframe
+        self.n = n
+        self.substeps = scenario.rates.substeps
+        self.dt_s = 1.0 / scenario.rates.physics_hz
+        self.x = initial_state(scenario.start.position_nwu_m, radians(scenario.start.yaw_deg), 0.0, n)
+        self.plant = plant_parameters(airframe, scenario.offnominal, scenario.ground_contact, n)
+        self.field = WindField(scenario.wind, n, self.dt_s)
+        self.wind = np.zeros((3, n))
+        self.estimate = np.zeros((tick.ESTIMATE_ROWS, n))
+        self.demand = np.zeros((tick.DEMAND_ROWS, n))
+        self.demand[tick.ATTITUDE] = 1.0
+        self.inner = np.zeros((tick.INNER_ROWS, n))
+        self.held = np.full(n, scenario.start.clamp)
+        self.gains = _gains(flight, parameters)
+        noise = scenario.noise
+        self.sigma = np.array(
+            [noise.position_m, noise.velocity_m_s, radians(noise.attitude_deg), radians(noise.rate_deg_s)]
+        )
+        self._command = np.zeros((4, n))
+        self._wind_generators = [seeds.generator(seed, "vehicle", j, "wind") for j in range(n)]
+        self._sensor_generators = [seeds.generator(seed, "vehicle", j, "sensors") for j in range(n)]
+        per_reset = self.field.normals_for_reset
+        self.field.reset(np.stack([g.standard_normal(per_reset) for g in self._wind_generators], axis=-1))
+        self._tick = 0
+        self._sensor_block = np.zeros((0, 0, n))
+        self._wind_block = np.zeros((0, 0, n))
+        self._draw()
+        self._measure()
+
+    def set_demand(self, j: int, setpoint: Setpoint | None) -> None:
+        """What vehicle `j`'s inner loops follow during the next tick; None stops its rotors."""
+        demand = self.demand
+        if setpoint is None:
+            demand[tick.KIND, j] = tick.STOPPED
+            return
+        demand[tick.THRUST, j] = setpoint.thrust
+        if isinstance(setpoint, AttitudeSetpoint):
+            demand[tick.KIND, j] = tick.ATTITUDE_KIND
+            demand[tick.ATTITUDE : tick.ATTITUDE + 4, j] = setpoint.attitude
+            demand[tick.YAW_RATE, j] = setpoint.yaw_rate_rad_s
+        elif isinstance(setpoint, RateSetpoint):
+            demand[tick.KIND, j] = tick.RATE_KIND
+            demand[tick.RATE : tick.RATE + 3, j] = setpoint.omega_flu_rad_s
+            demand[tick.YAW_RATE, j] = nan
+        else:
+            demand[tick.KIND, j] = tick.TORQUE_KIND
+            demand[tick.TORQUE : tick.TORQUE + 3, j] = setpoint.torque
+
+    def advance(self) -> None:
+        """One control period: the inner loops and the physics at the physics rate, then the sensors."""
+        row = self._tick % BLOCK_TICKS
+        if row == 0 and self._tick:
+            self._draw()
+        field = self.field
+        tick.advance(
+            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._command,
+            field.state, field.coefficients, self.wind, self._wind_block[row], self._sensor_block[row],
+            self.sigma, self._tick * self.substeps * self.dt_s, self.dt_s, self.substeps,
+        )  # fmt: skip
+        self._tick += 1
+
+    def _draw(self) -> None:
+        wind_rows = self.substeps * self.field.normals_per_step
+        sensor_rows = self.substeps * tick.GYRO_NORMALS + tick.MEASURE_NORMALS
+        self._wind_block = np.stack(
+            [g.standard_normal((BLOCK_TICKS, wind_rows)) for g in self._wind_generators], axis=-1
+        )
+        self._sensor_block = np.stack(
+            [g.standard_normal((BLOCK_TICKS, sensor_rows)) for g in self._sensor_generators], axis=-1
+        )
+
+    def _measure(self) -> None:
+        normals = np.stack([g.standard_normal(tick.MEASURE_NORMALS) for g in self._sensor_generators], axis=-1)
+        tick.measure(self.x, self.sigma, normals, self.estimate)
+
+
+def _gains(flight: Flight, parameters: Parameters) -> tick.Array:
+    airframe, p = flight.airframe, parameters
+    gains = np.zeros(tick.GAIN_ROWS)
+    gains[tick.ATTITUDE_P : tick.ATTITUDE_P + 3] = p["MC_ROLL_P"], p["MC_PITCH_P"], p["MC_YAW_P"]
+    for row, letter in ((tick.RATE_P, "P"), (tick.RATE_I, "I"), (tick.RATE_D, "D")):
+        gains[row : row + 3] = [p[f"MC_{axis}RATE_{letter}"] for axis in ("ROLL", "PITCH", "YAW")]
+    gains[tick.RATE_INTEGRAL_LIMIT : tick.RATE_INTEGRAL_LIMIT + 3] = [p[f"MC_{axis}_INT_LIM"] for axis in ("RR", "PR", "YR")]
+    gains[tick.RATE_MAX : tick.RATE_MAX + 3] = [radians(p[f"MC_{axis}RATE_MAX"]) for axis in ("ROLL", "PITCH", "YAW")]
+    gains[tick.YAW_WEIGHT] = p["MC_YAW_WEIGHT"]
+    gains[tick.MAX_TORQUE : tick.MAX_TORQUE + 3] = airframe.max_torque_n_m
+    gains[tick.MAX_THRUST] = airframe.max_thrust_n
+    gains[tick.THRUST_COEFFICIENT] = airframe.thrust_coefficient_n_s2
+    gains[tick.DRAG_COEFFICIENT] = airframe.drag_coefficient_n_m_s2
+    gains[tick.ARM] = airframe.arm_m
+    gains[tick.MAX_ROTOR_SPEED] = airframe.max_rotor_speed_rad_s
+    gains[tick.GYRO_SIGMA] = radians(flight.scenario.noise.rate_deg_s)
+    return gains

@@ -1,0 +1,195 @@
+"""One control cycle of the vehicle, compiled: rate loop, allocation, rotors, wind and rigid body at the physics rate.
+
+Everything random comes in as standard normals, so that a tick is a pure function of its arguments.
+"""
+
+from __future__ import annotations
+
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mavsitl.compiled import compiled
+from mavsitl.control.allocation import allocate
+from mavsitl_vehicle.autopilot.attitude import attitude_error, quaternion_product
+from mavsitl_vehicle.plant.step import rk4_step
+from mavsitl_vehicle.wind.field import wind_step
+
+Array = NDArray[np.float64]
+
+# Rows of `demand`, what the autopilot asks of the inner loops (DEMAND_ROWS, n).
+KIND = 0
+ATTITUDE = 1  # 1:5, quaternion FLU -> NWU
+RATE = 5  # 5:8, rad/s FLU; NaN: keep the present rate
+TORQUE = 8  # 8:11, shares of the largest torque, FLU
+THRUST = 11  # collective, 0..1
+YAW_RATE = 12  # yaw feed-forward about the world's z axis, rad/s; NaN: none
+DEMAND_ROWS = 13
+
+STOPPED, TORQUE_KIND, RATE_KIND, ATTITUDE_KIND = 0.0, 1.0, 2.0, 3.0
+
+# Rows of `gains`, one column for all vehicles of one airframe (GAIN_ROWS,).
+ATTITUDE_P = 0  # 0:3
+RATE_P = 3  # 3:6
+RATE_I = 6  # 6:9
+RATE_D = 9  # 9:12
+RATE_INTEGRAL_LIMIT = 12  # 12:15
+RATE_MAX = 15  # 15:18, rad/s
+YAW_WEIGHT = 18
+MAX_TORQUE = 19  # 19:22, N m
+MAX_THRUST = 22  # N
+THRUST_COEFFICIENT = 23
+DRAG_COEFFICIENT = 24
+ARM = 25
+MAX_ROTOR_SPEED = 26
+GYRO_SIGMA = 27  # rad/s
+GAIN_ROWS = 28
+
+# Rows of `estimate` (ESTIMATE_ROWS, n): position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s.
+ESTIMATE_ROWS = 13
+MEASURE_NORMALS = 12
+GYRO_NORMALS = 3
+
+# Rows of `inner` (INNER_ROWS, n), the inner loops' state and what they report.
+RATE_INTEGRAL = 0  # 0:3, torque share
+LAST_GYRO = 3  # 3:6, rad/s
+RATE_SETPOINT = 6  # 6:9, rad/s
+SATURATED = 9  # allocation's saturation bits, OR-ed over the tick
+INNER_ROWS = 10
+
+
+@compiled
+def rate_setpoint(demand: Array, estimate: Array, gains: Array, inner: Array, j: int) -> None:
+    """The attitude loop, once a tick: fills vehicle j's rate setpoint from its attitude setpoint (stock cascade)."""
+    ex, ey, ez = attitude_error(
+        estimate[6, j], estimate[7, j], estimate[8, j], estimate[9, j],
+        demand[ATTITUDE, j], demand[ATTITUDE + 1, j], demand[ATTITUDE + 2, j], demand[ATTITUDE + 3, j],
+        gains[YAW_WEIGHT],
+    )  # fmt: skip
+    yaw_gain = gains[ATTITUDE_P + 2] / gains[YAW_WEIGHT] if gains[YAW_WEIGHT] > 1e-4 else 0.0
+    p, q, r = gains[ATTITUDE_P] * ex, gains[ATTITUDE_P + 1] * ey, yaw_gain * ez
+    feed = demand[YAW_RATE, j]
+    if feed == feed:
+        w, x, y, z = estimate[6, j], estimate[7, j], estimate[8, j], estimate[9, j]
+        p += feed * 2.0 * (x * z - w * y)  # the world's z axis in body axes
+        q += feed * 2.0 * (y * z + w * x)
+        r += feed * (1.0 - 2.0 * (x * x + y * y))
+    inner[RATE_SETPOINT, j] = min(max(p, -gains[RATE_MAX]), gains[RATE_MAX])
+    inner[RATE_SETPOINT + 1, j] = min(max(q, -gains[RATE_MAX + 1]), gains[RATE_MAX + 1])
+    inner[RATE_SETPOINT + 2, j] = min(max(r, -gains[RATE_MAX + 2]), gains[RATE_MAX + 2])
+
+
+@compiled
+def inner_loops(
+    x: Array, demand: Array, gains: Array, inner: Array, held: NDArray[np.bool_], gyro_normals: Array, dt_s: float, command: Array
+) -> None:
+    """Rate PID (PX4's form) and allocation (eq 12 inverted) for one physics step: fills `command` (4, n), rotor speeds."""
+    for j in range(x.shape[1]):
+        kind = demand[KIND, j]
+        if kind == STOPPED:
+            for i in range(3):
+                inner[RATE_INTEGRAL + i, j] = 0.0
+                inner[LAST_GYRO + i, j] = x[10 + i, j]
+            for i in range(4):
+                command[i, j] = 0.0
+            continue
+        torque = (0.0, 0.0, 0.0)
+        if kind == TORQUE_KIND:
+            torque = (
+                demand[TORQUE, j] * gains[MAX_TORQUE],
+                demand[TORQUE + 1, j] * gains[MAX_TORQUE + 1],
+                demand[TORQUE + 2, j] * gains[MAX_TORQUE + 2],
+            )
+        else:
+            share = (0.0, 0.0, 0.0)
+            for i in range(3):
+                gyro = x[10 + i, j] + gains[GYRO_SIGMA] * gyro_normals[i, j]
+                setpoint = inner[RATE_SETPOINT + i, j]
+                error = setpoint - gyro if setpoint == setpoint else 0.0
+                acceleration = (gyro - inner[LAST_GYRO + i, j]) / dt_s
+                value = (
+                    gains[RATE_P + i] * error + inner[RATE_INTEGRAL + i, j] - gains[RATE_D + i] * acceleration
+                )
+                if not held[j]:
+                    limit = gains[RATE_INTEGRAL_LIMIT + i]
+                    integral = inner[RATE_INTEGRAL + i, j] + gains[RATE_I + i] * error * dt_s
+                    inner[RATE_INTEGRAL + i, j] = min(max(integral, -limit), limit)
+                inner[LAST_GYRO + i, j] = gyro
+                if i == 0:
+                    share = (value, share[1], share[2])
+                elif i == 1:
+                    share = (share[0], value, share[2])
+                else:
+                    share = (share[0], share[1], value)
+            torque = (
+                share[0] * gains[MAX_TORQUE],
+                share[1] * gains[MAX_TORQUE + 1],
+                share[2] * gains[MAX_TORQUE + 2],
+            )
+        o1, o2, o3, o4, saturated = allocate(
+            demand[THRUST, j] * gains[MAX_THRUST], torque[0], torque[1], torque[2],
+            gains[THRUST_COEFFICIENT], gains[DRAG_COEFFICIENT], gains[ARM], gains[MAX_ROTOR_SPEED],
+        )  # fmt: skip
+        command[0, j], command[1, j], command[2, j], command[3, j] = o1, o2, o3, o4
+        inner[SATURATED, j] = float(int(inner[SATURATED, j]) | saturated)
+
+
+@compiled
+def measure(x: Array, sigma: Array, normals: Array, estimate: Array) -> None:
+    """Gaussian white noise on every feedback variable: estimate (13, n) from truth and `normals` (12, n).
+
+    `sigma` (4,): position m, velocity m/s, attitude rad, rate rad/s. The attitude's noise is a small rotation in body axes.
+    """
+    for j in range(x.shape[1]):
+        for i in range(3):
+            estimate[i, j] = x[i, j] + sigma[0] * normals[i, j]
+            estimate[3 + i, j] = x[3 + i, j] + sigma[1] * normals[3 + i, j]
+            estimate[10 + i, j] = x[10 + i, j] + sigma[3] * normals[9 + i, j]
+        half = 0.5 * sigma[2]
+        hx, hy, hz = half * normals[6, j], half * normals[7, j], half * normals[8, j]
+        norm = np.sqrt(1.0 + hx * hx + hy * hy + hz * hz)
+        w, qx, qy, qz = quaternion_product(
+            x[6, j], x[7, j], x[8, j], x[9, j], 1.0 / norm, hx / norm, hy / norm, hz / norm
+        )
+        estimate[6, j], estimate[7, j], estimate[8, j], estimate[9, j] = w, qx, qy, qz
+
+
+@compiled
+def advance(
+    x: Array,
+    estimate: Array,
+    demand: Array,
+    gains: Array,
+    inner: Array,
+    held: NDArray[np.bool_],
+    plant: Array,
+    command: Array,
+    wind_state: Array,
+    wind_coefficients: Array,
+    wind: Array,
+    wind_normals: Array,
+    sensor_normals: Array,
+    sigma: Array,
+    time_s: float,
+    dt_s: float,
+    substeps: int,
+) -> None:
+    """One tick of `substeps` physics steps from `time_s` on, in place.
+
+    `wind_normals` (substeps * normals_per_step, n) and `sensor_normals` (substeps * 3 + 12, n) are consumed in order.
+    """
+    for j in range(x.shape[1]):
+        inner[SATURATED, j] = 0.0
+        if demand[KIND, j] == ATTITUDE_KIND:
+            rate_setpoint(demand, estimate, gains, inner, j)
+        elif demand[KIND, j] == RATE_KIND:
+            for i in range(3):
+                inner[RATE_SETPOINT + i, j] = demand[RATE + i, j]
+    per_step = wind_normals.shape[0] // substeps
+    for k in range(substeps):
+        normals = wind_normals[k * per_step : (k + 1) * per_step]
+        wind_step(wind_state, wind_coefficients, normals, time_s + k * dt_s, wind)
+        gyro_normals = sensor_normals[k * GYRO_NORMALS : (k + 1) * GYRO_NORMALS]
+        inner_loops(x, demand, gains, inner, held, gyro_normals, dt_s, command)
+        rk4_step(x, command, wind, plant, dt_s, held)
+    measure(x, sigma, sensor_normals[substeps * GYRO_NORMALS :], estimate)

@@ -1,0 +1,177 @@
+"""The vehicle: simulation and autopilot as one sans-IO core that a driver of the bridge runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mavsitl.control.inner_loop import InnerLoop
+from mavsitl.dialect import mavlink
+from mavsitl.frames import flip_quaternion, flip_vector
+from mavsitl.log import topics
+from mavsitl.log.ulog import Recorder
+from mavsitl.quaternion import to_euler
+from mavsitl.scenario import Flight
+from mavsitl_vehicle import tick
+from mavsitl_vehicle.autopilot import modes
+from mavsitl_vehicle.autopilot.autopilot import Autopilot
+from mavsitl_vehicle.autopilot.modes import Mode
+from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint, TorqueSetpoint
+from mavsitl_vehicle.simulation import Simulation
+
+
+class Vehicle:
+    """One vehicle. `receive` datagrams at any time; `step` once a control period; then take `datagrams` of each port."""
+
+    def __init__(
+        self,
+        flight: Flight,
+        recorder: Recorder,
+        *,
+        seed: int,
+        system_id: int = 1,
+        ports: Sequence[str] = ("offboard",),
+        lockstep: bool = False,
+    ) -> None:
+        """`ports` name the links in order: "offboard", "gcs". In `lockstep` the state is streamed every tick from the first."""
+        self.period_us = flight.scenario.rates.control_period_us
+        self.autopilot = Autopilot(flight, system_id, ports)
+        self.simulation = Simulation(flight, self.autopilot.parameters, seed)
+        self._flight = flight
+        self._recorder = recorder
+        self._record = _Record(recorder, flight)
+        self._seated: InnerLoop | None = None
+        """The PIDNN aboard, at level `attitude` with inner = "pidnn"."""
+        if flight.scenario.controller.inner == "pidnn":
+            self._seated = InnerLoop(flight.scenario.controller, flight.airframe, self.period_us / 1e6)
+        self._now_us = -self.period_us
+        self._done = False
+        if lockstep:
+            for port in self.autopilot.ports:
+                for message_id in _STATE_MESSAGES[flight.scenario.controller.telemetry]:
+                    port.schedule.set_interval(message_id, self.period_us, 0)
+
+    @property
+    def token_us(self) -> int:
+        """The stamp that the newest off-board setpoint echoes; lock-step advances when it is the tick's own."""
+        return self.autopilot.token_us
+
+    @property
+    def finished(self) -> bool:
+        """It has flown and is disarmed again."""
+        return self._done
+
+    @property
+    def flight_time_s(self) -> float:
+        """Since the release; negative before it."""
+        released = self.autopilot.released_us
+        return -1.0 if released is None else (self._now_us - released) / 1e6
+
+    @property
+    def counters(self) -> Any:
+        """Frames received and refused, by reason, of the first port."""
+        return self.autopilot.ports[0].node.counters
+
+    def receive(self, port: int, datagram: bytes) -> int:
+        """One datagram from a link; the number of valid frames in it."""
+        return self.autopilot.receive(port, datagram, self._now_us)
+
+    def step(self, now_us: int) -> None:
+        """Fly from the last step to `now_us`, one control period later, and say what is to be said there."""
+        autopilot, simulation = self.autopilot, self.simulation
+        first = self._now_us < 0
+        self._now_us = now_us
+        if not first:
+            simulation.held[0] = autopilot.held
+            setpoint = autopilot.decide(now_us - self.period_us)
+            simulation.set_demand(0, self._inner_law(setpoint))
+            simulation.advance()
+        estimate = simulation.estimate[:, 0].tolist()
+        autopilot.estimate = estimate
+        wind = simulation.wind[:, 0].tolist()
+        autopilot.true_wind = (wind[0], wind[1], wind[2])
+        autopilot.observe(now_us)
+        autopilot.report(now_us)
+        self._record.write(now_us, self, estimate, wind)
+        if autopilot.released_us is not None and not autopilot.commander.armed:
+            self._done = True
+
+    def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
+        """What goes out on a link: one message a datagram, or all of a tick in one (`combine`)."""
+        return self.autopilot.ports[port].node.datagrams(combine=combine)
+
+    def _inner_law(self, setpoint: Setpoint | None) -> Setpoint | None:
+        """With the PIDNN aboard, an attitude setpoint becomes a torque by it; all else passes."""
+        law = self._seated
+        if law is None or not isinstance(setpoint, AttitudeSetpoint) or self.autopilot.commander.mode is not Mode.OFFBOARD:
+            return setpoint
+        if self.autopilot.released_us is None:
+            law.reset()
+        estimate = self.simulation.estimate
+        angles = np.array(to_euler(estimate[6:10, 0].tolist()))[:, np.newaxis]
+        desired = np.array(to_euler(setpoint.attitude))[:, np.newaxis]
+        acceleration = law.update(angles, estimate[10:13], desired)
+        roll, pitch, yaw = law.torque_shares(acceleration)[:, 0].tolist()
+        return TorqueSetpoint((roll, pitch, yaw), setpoint.thrust)
+
+
+_STATE_MESSAGES = {
+    "odometry": (mavlink.MAVLINK_MSG_ID_ODOMETRY,),
+    "split": (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED),
+}
+
+
+class _Record:
+    """The vehicle's log: truth beside estimate every tick, states when they change."""
+
+    def __init__(self, recorder: Recorder, flight: Flight) -> None:
+        self._position_truth = recorder.topic(topics.LOCAL_POSITION_TRUTH)
+        self._attitude_truth = recorder.topic(topics.ATTITUDE_TRUTH)
+        self._rate_truth = recorder.topic(topics.ANGULAR_VELOCITY_TRUTH)
+        self._position = recorder.topic(topics.LOCAL_POSITION)
+        self._attitude = recorder.topic(topics.ATTITUDE)
+        self._rate = recorder.topic(topics.ANGULAR_VELOCITY)
+        self._wind = recorder.topic(topics.WIND_TRUTH)
+        self._motors = recorder.topic(topics.ACTUATOR_MOTORS)
+        self._rotors = recorder.topic(topics.ROTOR_STATUS)
+        self._rates_setpoint = recorder.topic(topics.RATES_SETPOINT)
+        self._status = recorder.topic(topics.VEHICLE_STATUS)
+        self._land = recorder.topic(topics.LAND_DETECTED)
+        self._largest_speed = flight.airframe.max_rotor_speed_rad_s
+        self._last_status: tuple[int, int, int] | None = None
+        self._last_land: int | None = None
+
+    def write(self, now_us: int, vehicle: Vehicle, e: list[float], wind: list[float]) -> None:
+        simulation, autopilot = vehicle.simulation, vehicle.autopilot
+        x = simulation.x[:, 0].tolist()
+        self._position_truth.append(now_us, *flip_vector(x[0], x[1], x[2]), *flip_vector(x[3], x[4], x[5]))
+        self._attitude_truth.append(now_us, *flip_quaternion(x[6], x[7], x[8], x[9]))
+        self._rate_truth.append(now_us, *flip_vector(x[10], x[11], x[12]))
+        self._position.append(now_us, *flip_vector(e[0], e[1], e[2]), *flip_vector(e[3], e[4], e[5]))
+        self._attitude.append(now_us, *flip_quaternion(e[6], e[7], e[8], e[9]))
+        self._rate.append(now_us, *flip_vector(e[10], e[11], e[12]))
+        self._wind.append(now_us, *flip_vector(wind[0], wind[1], wind[2]))
+        limit = self._largest_speed
+        self._motors.append(now_us, x[13] / limit, x[14] / limit, x[15] / limit, x[16] / limit)
+        inner = simulation.inner[:, 0].tolist()
+        self._rotors.append(now_us, x[13], x[14], x[15], x[16], int(inner[tick.SATURATED]))
+        thrust = float(simulation.demand[tick.THRUST, 0])
+        self._rates_setpoint.append(now_us, *flip_vector(inner[6], inner[7], inner[8]), 0.0, 0.0, -thrust)
+        commander = autopilot.commander
+        status = (2 if commander.armed else 1, modes.TABLE[commander.mode].nav_state, int(commander.failsafe))
+        if status != self._last_status:
+            self._last_status = status
+            self._status.append(now_us, *status)
+        landed = int(autopilot.released_us is None or autopilot.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND)
+        if landed != self._last_land:
+            self._last_land = landed
+            self._land.append(now_us, landed, landed)
+
+
+def build(flight: Flight, recorder: Recorder, **options: Any) -> Vehicle:
+    """The entry point `mavsitl.vehicle`: a vehicle core for the bridge's drivers."""
+    return Vehicle(flight, recorder, **options)
+
+

@@ -1,0 +1,178 @@
+"""The wind of a scenario: all its models, summed and advanced by one compiled step. It draws no random numbers."""
+
+from __future__ import annotations
+
+from math import cos, pi, radians, sin
+
+import numpy as np
+
+from mavsitl.compiled import compiled
+from mavsitl.scenario import DrydenMil, DrydenPaper, Gust, Steady, Wind
+from mavsitl_vehicle.wind import dryden
+from mavsitl_vehicle.wind.dryden import Array
+
+# Columns of `coefficients`, one row for each thing that blows.
+MODEL = 0
+DIRECTION = 1
+"""Columns 1:4, NWU: the velocity of a steady wind or gust, the unit vector of a turbulence component."""
+GUST_START = 4
+GUST_LENGTH = 5
+DECAY = 4
+CROSS = 5
+NOISE_11 = 6
+NOISE_21 = 7
+NOISE_22 = 8
+OUT_1 = 9
+OUT_2 = 10
+N_COLUMNS = 11
+
+# Values of MODEL.
+STEADY = 0.0
+GUST_PULSE = 1.0
+GUST_RAMP = 2.0
+FIRST_ORDER = 3.0
+SECOND_ORDER = 4.0
+
+
+@compiled
+def gust_share(time_s: float, start_s: float, length_s: float, pulse: bool) -> float:
+    """The 1-cosine gust: from 0 at `start_s` to 1 after `length_s`; a pulse then falls as slowly, a ramp stays."""
+    phase = (time_s - start_s) / length_s
+    if phase <= 0.0 or (pulse and phase >= 2.0):
+        return 0.0
+    if phase >= 1.0 and not pulse:
+        return 1.0
+    return 0.5 - 0.5 * cos(pi * phase)
+
+
+@compiled
+def wind_step(state: Array, coefficients: Array, normals: Array, time_s: float, wind_nwu_m_s: Array) -> None:
+    """Write the wind at `time_s` into `wind_nwu_m_s` (3, n), then advance the turbulence's `state` by one step.
+
+    `state` (normals_per_step, n) and `coefficients` (k, 11) are the `WindField`'s; `normals` has the shape of `state`.
+    """
+    n = wind_nwu_m_s.shape[1]
+    for axis in range(3):
+        for j in range(n):
+            wind_nwu_m_s[axis, j] = 0.0
+
+    row = 0
+    for k in range(coefficients.shape[0]):
+        c = coefficients[k]
+        model = c[MODEL]
+        to_x, to_y, to_z = c[DIRECTION], c[DIRECTION + 1], c[DIRECTION + 2]
+        if model < FIRST_ORDER:
+            share = 1.0
+            if model != STEADY:
+                share = gust_share(time_s, c[GUST_START], c[GUST_LENGTH], model == GUST_PULSE)
+            for j in range(n):
+                wind_nwu_m_s[0, j] += to_x * share
+                wind_nwu_m_s[1, j] += to_y * share
+                wind_nwu_m_s[2, j] += to_z * share
+        elif model == FIRST_ORDER:
+            for j in range(n):
+                s = state[row, j]
+                speed = c[OUT_1] * s
+                wind_nwu_m_s[0, j] += to_x * speed
+                wind_nwu_m_s[1, j] += to_y * speed
+                wind_nwu_m_s[2, j] += to_z * speed
+                state[row, j] = c[DECAY] * s + c[NOISE_11] * normals[row, j]
+            row += 1
+        else:
+            for j in range(n):
+                s_1 = state[row, j]
+                s_2 = state[row + 1, j]
+                speed = c[OUT_1] * s_1 + c[OUT_2] * s_2
+                wind_nwu_m_s[0, j] += to_x * speed
+                wind_nwu_m_s[1, j] += to_y * speed
+                wind_nwu_m_s[2, j] += to_z * speed
+                xi_1 = normals[row, j]
+                xi_2 = normals[row + 1, j]
+                state[row, j] = c[DECAY] * s_1 + c[NOISE_11] * xi_1
+                state[row + 1, j] = c[CROSS] * s_1 + c[DECAY] * s_2 + c[NOISE_21] * xi_1 + c[NOISE_22] * xi_2
+            row += 2
+
+
+class WindField:
+    """The sum of a scenario's winds over `n` vehicles, in steps of `dt_s`; each vehicle has turbulence of its own.
+
+    After `reset` with normals the turbulence is stationary; before, it starts from calm. Compiled callers pass `state`
+    (normals_per_step, n) and `coefficients` (k, 11) to `wind_step`; others call `step`.
+    Raises `ValueError` for `n` below 1 or a `dt_s` that is not positive.
+    """
+
+    def __init__(self, winds: tuple[Wind, ...], n: int, dt_s: float) -> None:
+        if n < 1 or not dt_s > 0.0:
+            raise ValueError(f"n = {n}, dt_s = {dt_s}: a wind field needs a vehicle and a step")
+        self.n = n
+        self.dt_s = dt_s
+        rows: list[list[float]] = []
+        self._filters: list[dryden.Filter] = []
+
+        for wind in winds:
+            match wind:
+                case Steady():
+                    rows.append([STEADY, *wind.velocity_nwu_m_s])
+                    continue
+                case Gust():
+                    model = GUST_PULSE if wind.shape == "pulse" else GUST_RAMP
+                    rows.append([model, *wind.velocity_nwu_m_s, wind.start_s, wind.length_s])
+                    continue
+                case DrydenPaper():
+                    axes = np.eye(3)
+                    filters = dryden.shaping_filters(
+                        dryden.paper_scales(wind), wind.form == "spectrum", wind.intensity == "two-pi"
+                    )
+                case DrydenMil():
+                    axes = mil_axes(wind.from_deg)
+                    filters = dryden.shaping_filters(dryden.mil_scales(wind), second_order=True, two_pi=True)
+                    if wind.include_mean:
+                        rows.append([STEADY, *(dryden.mil_mean_speed_m_s(wind) * axes[0])])
+            for filter_, axis in zip(filters, axes, strict=True):
+                model = FIRST_ORDER if filter_.order == 1 else SECOND_ORDER
+                noise = dryden.cholesky(*dryden.covariance(filter_, dt_s))
+                rows.append([model, *axis, *dryden.transition(filter_, dt_s), *noise, *dryden.output(filter_)])
+            self._filters += filters
+
+        self.coefficients: Array = np.zeros((len(rows), N_COLUMNS))
+        for k, row in enumerate(rows):
+            self.coefficients[k, : len(row)] = row
+        self.normals_per_step = sum(filter_.order for filter_ in self._filters)
+        """Standard normals for each vehicle and step: the first axis of `step`'s and `wind_step`'s normals."""
+        self.normals_for_reset = self.normals_per_step
+        """Standard normals for each vehicle that `reset` takes."""
+        self.state: Array = np.zeros((self.normals_per_step, n))
+
+    def reset(self, normals: Array) -> None:
+        """Draw the turbulence's state from its stationary distribution: `normals` (normals_for_reset, n), in place.
+
+        Raises `ValueError` for normals of another shape.
+        """
+        self._check(normals, self.normals_for_reset)
+        row = 0
+        for filter_ in self._filters:
+            l_11, l_21, l_22 = dryden.cholesky(*dryden.covariance(filter_, None))
+            self.state[row] = l_11 * normals[row]
+            if filter_.order == 2:
+                self.state[row + 1] = l_21 * normals[row] + l_22 * normals[row + 1]
+            row += filter_.order
+
+    def step(self, time_s: float, normals: Array, wind_nwu_m_s: Array) -> None:
+        """`wind_step` on this field's arrays: `normals` (normals_per_step, n) in, `wind_nwu_m_s` (3, n) out.
+
+        Raises `ValueError` for arrays of another shape.
+        """
+        self._check(normals, self.normals_per_step)
+        self._check(wind_nwu_m_s, 3)
+        wind_step(self.state, self.coefficients, normals, time_s, wind_nwu_m_s)
+
+    def _check(self, array: Array, rows: int) -> None:
+        if array.shape != (rows, self.n):
+            raise ValueError(f"an array of shape {array.shape}; ({rows}, {self.n}) is needed")
+
+
+def mil_axes(from_deg: float) -> Array:
+    """Rows u, v, w in NWU for a mean wind from `from_deg`, clockwise from north: u along it, w up, v = w x u."""
+    angle = radians(from_deg)
+    u_x, u_y = -cos(angle), sin(angle)
+    return np.array([[u_x, u_y, 0.0], [-u_y, u_x, 0.0], [0.0, 0.0, 1.0]])
