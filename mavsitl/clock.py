@@ -157,3 +157,8 @@ class PacedClock:
         """Simulated over wall time since the start, lost time included; 0 before any time has passed."""
         elapsed_ns = self._monotonic_ns() - self._started_ns
         return self.now_us * 1000 / elapsed_ns if elapsed_ns > 0 else 0.0
+
+
+def utc_stamp() -> str:
+    """The wall clock in UTC, ISO 8601 to the second, for names and headers only."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

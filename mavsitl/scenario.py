@@ -32,7 +32,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """What all parts of a scenario share: frozen, and strict about unknown keys."""
 
 
-class Rates(Section):
+class Rates(Section, frozen=True):
     physics_hz: Annotated[int, msgspec.Meta(ge=50, le=20_000)] = 1000
     control_hz: Annotated[int, msgspec.Meta(ge=10, le=1000)] = 250
     """Off-board cycle: telemetry out, setpoint in. A whole number of milliseconds, because the wire's stamp is in ms."""
@@ -46,14 +46,14 @@ class Rates(Section):
         return self.physics_hz // self.control_hz
 
 
-class Start(Section):
+class Start(Section, frozen=True):
     position_nwu_m: Vector3 = (0.0, 0.0, 0.0)
     yaw_deg: float = 0.0
     clamp: bool = False
     """Held at the start pose, rotors free, until it has been armed in OFFBOARD for COM_SPOOLUP_TIME."""
 
 
-class Offnominal(Section):
+class Offnominal(Section, frozen=True):
     """What the vehicle is and the controller does not know."""
 
     mass_scale: Positive = 1.0
@@ -61,13 +61,13 @@ class Offnominal(Section):
     rotor_thrust_scale: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (1.0, 1.0, 1.0, 1.0)
 
 
-class Steady(Section, tag_field="model", tag="steady"):
+class Steady(Section, frozen=True, tag_field="model", tag="steady"):
     """A constant wind: the air moves along `velocity_nwu_m_s`."""
 
     velocity_nwu_m_s: Vector3
 
 
-class Gust(Section, tag_field="model", tag="gust"):
+class Gust(Section, frozen=True, tag_field="model", tag="gust"):
     """The 1-cosine gust of MIL-F-8785C: 0 before `start_s`, rising over `length_s` to its amplitude, then held or gone."""
 
     velocity_nwu_m_s: Vector3
@@ -76,7 +76,7 @@ class Gust(Section, tag_field="model", tag="gust"):
     shape: Literal["pulse", "ramp"] = "pulse"
 
 
-class DrydenPaper(Section, tag_field="model", tag="dryden-paper"):
+class DrydenPaper(Section, frozen=True, tag_field="model", tag="dryden-paper"):
     """Eqs 14-17 with Table 1's numbers (sigma_v = sigma_u^2 / sigma_w as printed, metres in the formulas)."""
 
     wind_speed_20ft_m_s: Positive = 10.0
@@ -87,7 +87,7 @@ class DrydenPaper(Section, tag_field="model", tag="dryden-paper"):
     """Intensity of eq 16's white noise: R(tau) = 2 pi delta(tau), which gives sigma, or delta(tau) as the words say."""
 
 
-class DrydenMil(Section, tag_field="model", tag="dryden-mil"):
+class DrydenMil(Section, frozen=True, tag_field="model", tag="dryden-mil"):
     """MIL-F-8785C / MIL-HDBK-1797 low-altitude model, turned with the mean wind; the mean itself included on request."""
 
     wind_speed_20ft_m_s: Positive
@@ -100,7 +100,7 @@ class DrydenMil(Section, tag_field="model", tag="dryden-mil"):
 Wind: TypeAlias = Steady | Gust | DrydenPaper | DrydenMil
 
 
-class Noise(Section):
+class Noise(Section, frozen=True):
     """1-sigma of the Gaussian white noise on every feedback variable (section 5 of the paper; levels: see the docs)."""
 
     position_m: NonNegative = 0.005
@@ -109,12 +109,12 @@ class Noise(Section):
     rate_deg_s: NonNegative = 0.1
 
 
-class Hover(Section, tag_field="kind", tag="hover"):
+class Hover(Section, frozen=True, tag_field="kind", tag="hover"):
     position_nwu_m: Vector3 = (0.0, 0.0, 1.0)
     yaw_deg: float = 0.0
 
 
-class Spiral(Section, tag_field="kind", tag="spiral"):
+class Spiral(Section, frozen=True, tag_field="kind", tag="spiral"):
     """Section 5.2: X_d = [r sin(w t), r cos(w t), v t]."""
 
     radius_m: Positive = 1.0
@@ -122,19 +122,19 @@ class Spiral(Section, tag_field="kind", tag="spiral"):
     climb_m_s: float = 0.0333
 
 
-class Step(Section):
+class Step(Section, frozen=True):
     time_s: NonNegative
     position_nwu_m: Vector3
     yaw_deg: float = 0.0
 
 
-class Steps(Section, tag_field="kind", tag="steps"):
+class Steps(Section, frozen=True, tag_field="kind", tag="steps"):
     """Holds each position from its time on."""
 
     steps: Annotated[tuple[Step, ...], msgspec.Meta(min_length=1)]
 
 
-class Figure8(Section, tag_field="kind", tag="figure-8"):
+class Figure8(Section, frozen=True, tag_field="kind", tag="figure-8"):
     """A Gerono lemniscate, entered from its centre with a smooth start over `ramp_s`."""
 
     length_m: Positive = 4.0
@@ -144,7 +144,7 @@ class Figure8(Section, tag_field="kind", tag="figure-8"):
     ramp_s: NonNegative = 4.0
 
 
-class Waypoints(Section, tag_field="kind", tag="waypoints"):
+class Waypoints(Section, frozen=True, tag_field="kind", tag="waypoints"):
     """Straight legs at `speed_m_s` through the rows of a CSV file: x, y, z in metres NWU, yaw in degrees, hold in seconds."""
 
     file: str
@@ -154,7 +154,7 @@ class Waypoints(Section, tag_field="kind", tag="waypoints"):
 Reference: TypeAlias = Hover | Spiral | Steps | Figure8 | Waypoints
 
 
-class Gains(Section):
+class Gains(Section, frozen=True):
     """A PID on acceleration: acceleration = k_p e + k_i integral(e) + k_d e'."""
 
     k_p_per_s2: NonNegative
@@ -162,7 +162,7 @@ class Gains(Section):
     k_d_per_s: NonNegative
 
 
-class Learning(Section):
+class Learning(Section, frozen=True):
     """On-line learning of the three PIDNNs, eqs 30-57, and the guards that keep it stable (docs: explanation/pidnn)."""
 
     rate: tuple[NonNegative, NonNegative, NonNegative] = (10.0, 10.0, 10.0)
@@ -183,14 +183,14 @@ class Learning(Section):
     """Input weights: +1 and -1 (eq 38), or learned by eqs 34-36."""
 
 
-class WindObserver(Section):
+class WindObserver(Section, frozen=True):
     """Bandwidths of the velocity disturbance observer that stands in for W_1..W_3."""
 
     horizontal_rad_s: Positive = 22.0
     vertical_rad_s: Positive = 16.5
 
 
-class Controller(Section):
+class Controller(Section, frozen=True):
     law: Literal["pidnn", "pid"] = "pidnn"
     level: Level = "body_rate"
     """Where the loop closes: q + thrust, body rates + thrust, or U1..U4 over the wire."""
@@ -213,7 +213,7 @@ class Controller(Section):
     wind_observer: WindObserver = WindObserver()
 
 
-class Scenario(Section):
+class Scenario(Section, frozen=True):
     title: str
     description: str = ""
     duration_s: Positive = 60.0
@@ -276,7 +276,8 @@ def load_airframe(name_or_path: str, folder: Path | None = None) -> Airframe:
         if entry.name.endswith(".toml")
     )
     text, where, _ = _read("airframes", name_or_path, shipped, folder)
-    return _convert(_parse(text, where), Airframe, where)
+    airframe: Airframe = _convert(_parse(text, where), Airframe, where)
+    return airframe
 
 
 def _read(kind: str, name_or_path: str, shipped: list[str], folder: Path | None = None) -> tuple[str, str, Path]:
@@ -285,7 +286,9 @@ def _read(kind: str, name_or_path: str, shipped: list[str], folder: Path | None 
         return resource.read_text("utf-8"), f"{name_or_path} (shipped)", Path()
     path = (folder or Path()) / name_or_path
     if path.suffix != ".toml":
-        raise ScenarioError(f"{name_or_path}: no such shipped file and not a .toml path; shipped {kind}: {', '.join(shipped)}")
+        raise ScenarioError(
+            f"{name_or_path}: no such shipped file and not a .toml path; shipped {kind}: {', '.join(shipped)}"
+        )
     try:
         return path.read_text("utf-8"), str(path), path.parent
     except (OSError, UnicodeDecodeError) as error:
@@ -458,10 +461,14 @@ def _check(scenario: Scenario, where: str) -> None:
             + ", ".join(str(hz) for hz in range(10, 1001) if 1000 % hz == 0)
         )
     if MICROSECONDS_PER_SECOND % rates.physics_hz:
-        raise ScenarioError(f"{where}: rates.physics_hz: one step of {rates.physics_hz} Hz is not a whole number of microseconds")
+        raise ScenarioError(
+            f"{where}: rates.physics_hz: one step of {rates.physics_hz} Hz is not a whole number of microseconds"
+        )
     controller = scenario.controller
     if controller.inner == "pidnn" and controller.level != "attitude":
-        raise ScenarioError(f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'")
+        raise ScenarioError(
+            f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'"
+        )
     if controller.learning.guards and controller.learning.projection is None:
         raise ScenarioError(f"{where}: controller.learning.projection: may be left out only with guards = false")
     steps = scenario.reference.steps if isinstance(scenario.reference, Steps) else ()

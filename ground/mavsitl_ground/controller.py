@@ -59,7 +59,9 @@ class Controller:
         )  # fmt: skip
         self._filter = FirstOrder(settings.angle_filter_rad_s, self._period_s, rows=2)
         self._inner = InnerLoop(settings, airframe, self._period_s)
-        self._wind_observer = WindObserver(settings.wind_observer.horizontal_rad_s, settings.wind_observer.vertical_rad_s)
+        self._wind_observer = WindObserver(
+            settings.wind_observer.horizontal_rad_s, settings.wind_observer.vertical_rad_s
+        )
         self._rate_gain = _rate_gain(flight) if settings.level == "body_rate" else np.ones((3, 1))
         tau = airframe.rotor_time_constant_s
         self._thrust_share = 1.0 - exp(-self._period_s / tau) if tau > 0.0 else 1.0
@@ -161,10 +163,14 @@ def _rate_gain(flight: Flight) -> Array:
     """Angular acceleration per rad/s of rate error of the vehicle's rate loop (3, 1), 1/s, from its MC_*RATE_P."""
     airframe, gains = flight.airframe, []
     parameters = airframe.parameters | flight.scenario.parameters
-    for axis, torque, inertia in zip(("ROLL", "PITCH", "YAW"), airframe.max_torque_n_m, airframe.inertia_kg_m2, strict=True):
+    for axis, torque, inertia in zip(
+        ("ROLL", "PITCH", "YAW"), airframe.max_torque_n_m, airframe.inertia_kg_m2, strict=True
+    ):
         name = f"MC_{axis}RATE_P"
         if not parameters.get(name, 0.0) > 0.0:
-            raise ScenarioError(f"{flight.name}: parameters.{name}: level 'body_rate' needs it in the airframe or the scenario")
+            raise ScenarioError(
+                f"{flight.name}: parameters.{name}: level 'body_rate' needs it in the airframe or the scenario"
+            )
         gains.append([parameters[name] * torque / inertia])
     return np.array(gains)
 
@@ -265,10 +271,16 @@ class Ground:
         if state.fresh:
             state.take()
             self._control(now_us)
-        if now_us - self._heartbeat_us >= HEARTBEAT_INTERVAL_US:
+        if now_us - self._heartbeat_us >= HEARTBEAT_INTERVAL_US and not self.finished:
             self._heartbeat_us = now_us
             self._node.send(
-                HEARTBEAT, mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+                HEARTBEAT,
+                mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+                mavlink.MAV_AUTOPILOT_INVALID,
+                0,
+                0,
+                mavlink.MAV_STATE_ACTIVE,
+                3,
             )
 
     def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
@@ -277,7 +289,7 @@ class Ground:
     def _control(self, now_us: int) -> None:
         handshake, state, controller = self._handshake, self._observer, self._controller
         target = handshake.target
-        if target is None:
+        if target is None or self.finished:
             return
         if self._released_us is None or not (handshake.in_control or handshake.phase is Phase.STOP):
             controller.reset()
@@ -335,5 +347,3 @@ class Ground:
 def build(flight: Flight, recorder: Recorder, **options: Any) -> Ground:
     """The entry point `mavsitl.ground`: a ground core for the bridge's drivers."""
     return Ground(flight, recorder, **options)
-
-

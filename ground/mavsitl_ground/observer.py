@@ -64,7 +64,9 @@ class Observer:
             self._on_odometry(message, now_us)
         elif kind == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
             q = (message.q1, message.q2, message.q3, message.q4)
-            self._attitude(q, (message.rollspeed, message.pitchspeed, message.yawspeed), message.time_boot_ms * 1000, now_us)
+            self._attitude(
+                q, (message.rollspeed, message.pitchspeed, message.yawspeed), message.time_boot_ms * 1000, now_us
+            )
         elif kind == mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
             position, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
             self._position(position, velocity, message.time_boot_ms * 1000)
@@ -103,5 +105,3 @@ class Observer:
         self.position_nwu_m[:, 0] = flip_vector(*position)
         self.velocity_nwu_m_s[:, 0] = flip_vector(*velocity)
         self._position_us = stamp_us
-
-

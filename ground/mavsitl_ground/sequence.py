@@ -80,7 +80,9 @@ class Handshake:
         return self.target == (system_id, component_id)
 
     def on_heartbeat(self, message: Any, system_id: int, component_id: int, now_us: int) -> None:
-        is_autopilot = message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
+        is_autopilot = (
+            message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
+        )
         if not is_autopilot or self._wanted_system not in (None, system_id):
             return
         if self.target is None:
@@ -152,7 +154,9 @@ class Handshake:
             self._arm(now_us)
         else:
             custom = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-            self._ask("OFFBOARD", now_us, mavlink.MAV_CMD_DO_SET_MODE, custom, PX4_MAIN_MODE_OFFBOARD, 0, nan, nan, nan, nan)
+            self._ask(
+                "OFFBOARD", now_us, mavlink.MAV_CMD_DO_SET_MODE, custom, PX4_MAIN_MODE_OFFBOARD, 0, nan, nan, nan, nan
+            )
 
     def _arm(self, now_us: int) -> None:
         if self.armed:
@@ -183,7 +187,9 @@ class Handshake:
             if self.offboard:
                 self._ask("landing", now_us, mavlink.MAV_CMD_NAV_LAND, nan, nan, nan, nan, nan, nan, nan)
         else:
-            self._ask("disarming", now_us, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE_DISARM, nan, nan, nan, nan, nan)
+            self._ask(
+                "disarming", now_us, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE_DISARM, nan, nan, nan, nan, nan
+            )
 
     def _nothing(self, now_us: int) -> None:
         pass

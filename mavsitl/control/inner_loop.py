@@ -43,11 +43,13 @@ class InnerLoop:
 
     def torque_shares(self, acceleration_rad_s2: Floats) -> Floats:
         """(3, n) in -1..1: shares of the airframe's largest torque, eqs 11 and 12 with the torque's arm included."""
-        return np.clip(acceleration_rad_s2 / self._per_share, -1.0, 1.0)
+        shares: Floats = np.clip(acceleration_rad_s2 / self._per_share, -1.0, 1.0)
+        return shares
 
     def torque_n_m(self, acceleration_rad_s2: Floats) -> Floats:
         """(3, n), N m."""
-        return acceleration_rad_s2 * self._inertia
+        torque: Floats = acceleration_rad_s2 * self._inertia
+        return torque
 
     def reset(self) -> None:
         """Back to the identical PID, integrators empty."""

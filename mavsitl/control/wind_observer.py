@@ -17,24 +17,23 @@ def _step(
     period: float,
     horizontal: float,
     vertical: float,
-    predicted: Floats,
+    last_velocity: Floats,
     started: Floats,
     wind: Floats,
 ) -> None:
     if velocity.shape != wind.shape or model.shape != wind.shape:
         raise ValueError("velocity and model acceleration must have shape (3, n)")
     for axis in range(3):
-        gain = 0.0
-        if period > 0.0:
-            bandwidth = vertical if axis == 2 else horizontal
-            gain = -math.expm1(-bandwidth * period) / period
+        bandwidth = vertical if axis == 2 else horizontal
+        share = -math.expm1(-bandwidth * period)
         for i in range(wind.shape[1]):
             if started[i] == 0.0:
-                predicted[axis, i] = velocity[axis, i]
+                last_velocity[axis, i] = velocity[axis, i]
                 wind[axis, i] = 0.0
             elif period > 0.0:
-                predicted[axis, i] += period * (model[axis, i] + wind[axis, i])
-                wind[axis, i] = gain * (velocity[axis, i] - predicted[axis, i])
+                acceleration = (velocity[axis, i] - last_velocity[axis, i]) / period
+                wind[axis, i] += share * (acceleration - model[axis, i] - wind[axis, i])
+                last_velocity[axis, i] = velocity[axis, i]
     for i in range(wind.shape[1]):
         started[i] = 1.0
 
@@ -69,9 +68,12 @@ def model_acceleration(
 class WindObserver:
     """z' = a_model + W, W = L (v - z): W follows the true W_1..W_3 as a first-order lag of bandwidth L per axis.
 
-    Not in the paper, whose eqs 19, 25 and 26 take W as known. In discrete time z is integrated over the period with
-    both accelerations held, and W = (1 - exp(-L T)) / T (v - z): the pole is exp(-L T), so any bandwidth and period is
-    stable.
+    Not in the paper, whose eqs 19, 25 and 26 take W as known. Without z that is W' = L (v' - a_model - W), solved
+    exactly for accelerations held over the period T:
+
+        W += (1 - exp(-L T)) ((v - v_last) / T - a_model - W)
+
+    The pole is exp(-L T): stable at any bandwidth, and T may differ from call to call.
     """
 
     def __init__(self, horizontal_rad_s: float, vertical_rad_s: float, n: int = 1) -> None:
@@ -80,7 +82,7 @@ class WindObserver:
             raise ValueError("horizontal_rad_s and vertical_rad_s must be greater than 0")
         self._horizontal = float(horizontal_rad_s)
         self._vertical = float(vertical_rad_s)
-        self._predicted = np.zeros((3, n))
+        self._last_velocity = np.zeros((3, n))
         self._started = np.zeros(n)
         self.acceleration_nwu_m_s2 = np.zeros((3, n))
         """W_1..W_3 as last estimated."""
@@ -98,7 +100,7 @@ class WindObserver:
             period_s,
             self._horizontal,
             self._vertical,
-            self._predicted,
+            self._last_velocity,
             self._started,
             self.acceleration_nwu_m_s2,
         )

@@ -6,7 +6,6 @@ import io
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -68,13 +67,11 @@ def decimate(time: Array, values: Array, points: int = POINTS) -> tuple[Array, A
     if size <= points:
         return time, values
     edges = np.linspace(0, size, points // 2 + 1).astype(np.int64)
-    chosen = []
-    for start, stop in pairwise(edges):
-        part = values[start:stop]
-        if np.all(np.isnan(part)):
-            chosen.append(int(start))
-        else:
-            chosen += sorted({int(start + np.nanargmin(part)), int(start + np.nanargmax(part))})
+    stretch = np.repeat(np.arange(edges.size - 1), np.diff(edges))
+    # Sorted by value within each stretch, the first is the least and the last the largest; NaN where all are NaN.
+    low = np.lexsort((np.where(np.isnan(values), np.inf, values), stretch))[edges[:-1]]
+    high = np.lexsort((np.where(np.isnan(values), -np.inf, values), stretch))[edges[1:] - 1]
+    chosen = np.unique(np.concatenate((low, high)))
     return time[chosen], values[chosen]
 
 
@@ -82,7 +79,7 @@ def wind(flight: FlightData, counterpart: str) -> Drawing:
     """u, v, w along x, y, z."""
 
     def draw(figure: Figure) -> None:
-        for axes, axis, name in zip(_stack(figure, 3), range(3), "uvw", strict=True):
+        for axes, axis, name in zip(_grid(figure, 3, 1).flat, range(3), "uvw", strict=True):
             _line(axes, flight.time_s, flight.wind_nwu_m_s[:, axis], WIND)
             axes.set_ylabel(f"{name} / (m/s)")
 
@@ -91,7 +88,7 @@ def wind(flight: FlightData, counterpart: str) -> Drawing:
 
 def altitude(flights: Flights, counterpart: str) -> Drawing:
     def draw(figure: Figure) -> None:
-        (axes,) = _stack(figure, 1)
+        axes = _grid(figure, 1, 1, legend=True)[0, 0]
         _axis_against_reference(axes, flights, 2)
         axes.set_ylabel("z / m")
         _legend(figure, axes)
@@ -101,7 +98,7 @@ def altitude(flights: Flights, counterpart: str) -> Drawing:
 
 def horizontal(flights: Flights, counterpart: str) -> Drawing:
     def draw(figure: Figure) -> None:
-        rows = _stack(figure, 2)
+        rows = _grid(figure, 2, 1, legend=True)[:, 0]
         for axes, axis in zip(rows, range(2), strict=True):
             _axis_against_reference(axes, flights, axis)
             axes.set_ylabel(f"{'xy'[axis]} / m")
@@ -112,7 +109,7 @@ def horizontal(flights: Flights, counterpart: str) -> Drawing:
 
 def position(flights: Flights, counterpart: str) -> Drawing:
     def draw(figure: Figure) -> None:
-        rows = _stack(figure, 3)
+        rows = _grid(figure, 3, 1, legend=True)[:, 0]
         for axes, axis in zip(rows, range(3), strict=True):
             _axis_against_reference(axes, flights, axis)
             axes.set_ylabel(f"{'xyz'[axis]} / m")
@@ -123,7 +120,6 @@ def position(flights: Flights, counterpart: str) -> Drawing:
 
 def path_3d(flights: Flights, counterpart: str) -> Drawing:
     def draw(figure: Figure) -> None:
-        figure.set_layout_engine("none")
         axes: Any = figure.add_axes((0.12, 0.0, 0.76, 0.98), projection="3d", computed_zorder=False)
         for label, colour, flight in flights:
             axes.plot(*_track(flight.position_nwu_m), color=colour, label=label, linewidth=1.2, zorder=2)
@@ -152,7 +148,7 @@ def attitude(flight: FlightData, colour: str, air: str, counterpart: str) -> Dra
 
     def draw(figure: Figure) -> None:
         error = flight.attitude_error_deg()
-        grid: Any = figure.subplots(3, 2, sharex=True, gridspec_kw={"width_ratios": (1.6, 1.0)})
+        grid = _grid(figure, 3, 2, legend=True, widths=(1.6, 1.0))
         for row, name in enumerate("φθψ"):
             left, right = grid[row]
             # Underneath and thick: the two lie on one another, and a dashed line would hide the thin one.
@@ -162,7 +158,6 @@ def attitude(flight: FlightData, colour: str, air: str, counterpart: str) -> Dra
             left.set_ylabel(f"{name} / °")
             right.set_ylabel(f"{name} error / °")
         _time_axis(grid[2], flight.time_s)
-        figure.align_ylabels(grid)
         _legend(figure, grid[0][0])
 
     return Drawing(_svg(draw, 5.2, "attitude"), f"Attitude and its tracking error, {air}", counterpart)
@@ -181,7 +176,7 @@ def weights(flight: FlightData, air: str) -> Drawing | None:
         ratio = np.where(initial == 0.0, np.nan, table / initial)
 
     def draw(figure: Figure) -> None:
-        columns: Any = figure.subplots(1, 3, sharex=True, sharey=True)
+        columns = _grid(figure, 1, 3, legend=True, titles=True, share_y=True, gap_in=0.2)[0]
         for net, axes in enumerate(columns):
             for term, colour in enumerate(_TERMS):
                 _line(axes, flight.time_s, ratio[:, net, term], colour, label="PID"[term])
@@ -196,11 +191,9 @@ def weights(flight: FlightData, air: str) -> Drawing | None:
 def rotors(flight: FlightData, colour: str, air: str) -> Drawing | None:
     if flight.rotor_speed_rad_s is None:
         return None
-    names = [f"{n} {place}" for n, place in enumerate(("rear", "right", "front", "left"), start=1)]
-    svg = _four(
-        flight, flight.rotor_speed_rad_s, colour, [f"rotor {n}\n/ (rad/s)" for n in names], share=True, name="rotors"
-    )
-    return Drawing(svg, f"Rotor speeds, {air}", "", half=True)
+    labels = [f"rotor {n} / (rad/s)" for n in range(1, 5)]
+    svg = _four(flight, flight.rotor_speed_rad_s, colour, labels, share=True, name="rotors")
+    return Drawing(svg, f"Rotor speeds (1 rear, 2 right, 3 front, 4 left), {air}", "", half=True)
 
 
 def demand(flight: FlightData, colour: str, air: str) -> Drawing | None:
@@ -217,7 +210,7 @@ def link(flight: FlightData, colour: str, air: str) -> Drawing | None:
     status = flight.link
 
     def draw(figure: Figure) -> None:
-        left, right = _columns(figure, 2)
+        left, right = _grid(figure, 1, 2, legend=True)[0]
         _line(left, flight.time_s, status.state_age_ms, colour)
         left.set_ylabel("age of the state / ms")
         left.set_ylim(bottom=0.0)
@@ -227,18 +220,17 @@ def link(flight: FlightData, colour: str, air: str) -> Drawing | None:
         right.set_ylim(bottom=0.0)
         right.yaxis.get_major_locator().set_params(integer=True)
         _time_axis((left, right), flight.time_s)
-        right.legend(loc="upper left", ncols=2)
+        _legend(figure, right)
 
     return Drawing(_svg(draw, 2.3, "link", _HALF_WIDTH_IN), f"Link to the ground, {air}", "", half=True)
 
 
 def _four(flight: FlightData, values: Array, colour: str, labels: list[str], *, share: bool, name: str) -> str:
     def draw(figure: Figure) -> None:
-        grid: Any = figure.subplots(2, 2, sharex=True, sharey=share)
+        grid = _grid(figure, 2, 2, share_y=share)
         for axes, column, label in zip(grid.flat, range(4), labels, strict=True):
             _line(axes, flight.time_s, values[:, column], colour, width=0.7)
             axes.set_ylabel(label)
-        figure.align_ylabels(grid)
         _time_axis(grid[1], flight.time_s)
 
     return _svg(draw, 3.7, name, _HALF_WIDTH_IN)
@@ -254,14 +246,36 @@ def _finite(values: Array) -> Array:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def _stack(figure: Figure, count: int) -> list[Axes]:
-    rows = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
-    figure.align_ylabels(rows)
-    return rows
-
-
-def _columns(figure: Figure, count: int) -> list[Any]:
-    return list(figure.subplots(1, count, sharex=True, squeeze=False)[0])
+def _grid(
+    figure: Figure,
+    rows: int,
+    columns: int,
+    *,
+    legend: bool = False,
+    titles: bool = False,
+    share_y: bool = False,
+    widths: tuple[float, ...] | None = None,
+    gap_in: float = 0.95,
+) -> Any:
+    """(rows, columns) axes over one time axis, margins in inches: the same in every figure, and nothing to solve."""
+    width, height = figure.get_size_inches()
+    left, right, bottom = 0.85, 0.2, 0.52
+    top = 0.12 + (0.3 if legend else 0.0) + (0.2 if titles else 0.0)
+    figure.subplots_adjust(
+        left=left / width,
+        right=1.0 - right / width,
+        bottom=bottom / height,
+        top=1.0 - top / height,
+        wspace=gap_in * columns / (width - left - right - gap_in * (columns - 1)),
+        hspace=0.16 * rows / (height - bottom - top - 0.16 * (rows - 1)),
+    )
+    ratios = {} if widths is None else {"width_ratios": widths}
+    grid: Any = figure.subplots(rows, columns, sharex=True, sharey=share_y, squeeze=False, gridspec_kw=ratios)
+    for axes in grid.flat:
+        box = axes.get_position()
+        axes.yaxis.set_label_coords(-0.66 / (box.width * width), 0.5)
+        axes.xaxis.set_label_coords(0.5, -0.32 / (box.height * height))
+    return grid
 
 
 def _line(
@@ -295,7 +309,7 @@ def _axis_against_reference(axes: Axes, flights: Flights, axis: int) -> None:
 
 def _legend(figure: Figure, axes: Any) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
+    figure.legend(handles, labels, loc="upper right", ncols=len(labels), borderaxespad=0.2)
 
 
 def _svg(draw: Callable[[Figure], None], height_in: float, name: str, width_in: float = _WIDTH_IN) -> str:
@@ -306,7 +320,7 @@ def _svg(draw: Callable[[Figure], None], height_in: float, name: str, width_in: 
     # The context puts matplotlib's settings back; fonts come with matplotlib, so every machine draws the same.
     settings: Any = {**matplotlib.rcParamsDefault, "backend": "agg", **_STYLE}
     with matplotlib.rc_context(settings):
-        figure = Figure(figsize=(width_in, height_in), layout="constrained")
+        figure = Figure(figsize=(width_in, height_in))
         FigureCanvasSVG(figure)
         draw(figure)
         text = io.StringIO()

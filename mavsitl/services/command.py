@@ -64,7 +64,9 @@ class Pending(NamedTuple):
 class CommandClient:
     """Sends one command at a time, repeats it until its COMMAND_ACK or the last try. Step it with the time."""
 
-    def __init__(self, send: Callable[[int, int, tuple[float, ...]], None], timeout_us: int = 500_000, tries: int = 5) -> None:
+    def __init__(
+        self, send: Callable[[int, int, tuple[float, ...]], None], timeout_us: int = 500_000, tries: int = 5
+    ) -> None:
         """`send(command, confirmation, params)` puts a COMMAND_LONG on the wire."""
         self._send = send
         self._timeout_us = timeout_us
@@ -100,7 +102,11 @@ class CommandClient:
 
     def receive(self, ack: Any) -> None:
         """A COMMAND_ACK from the vehicle."""
-        if self._pending is None or ack.command != self._pending.command or ack.result == mavlink.MAV_RESULT_IN_PROGRESS:
+        if (
+            self._pending is None
+            or ack.command != self._pending.command
+            or ack.result == mavlink.MAV_RESULT_IN_PROGRESS
+        ):
             return
         self.result = ack.result
         self._pending = None

@@ -1,4 +1,4 @@
-"""Every compiled text of the laws on the same random inputs: ``python -m tests.control.exercise`` prints their digests."""
+"""Every compiled law on the same random inputs: ``python -m tests.control.exercise`` prints the outputs' digests."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ LEARNING = {
 
 
 def _unit(quaternion: Floats) -> Floats:
-    return quaternion / np.sqrt((quaternion * quaternion).sum(axis=0))
+    norm: Floats = np.sqrt((quaternion * quaternion).sum(axis=0))
+    return np.divide(quaternion, norm)
 
 
 def digests() -> dict[str, str]:
@@ -83,8 +84,9 @@ def digests() -> dict[str, str]:
             add(f"net {key}", out, net.weights, net.input_weights, net.hidden)
         add("mix", mix.update(rates), mix.u)
         u1, x, y, z = (float(v) for v in rng.normal(size=4) * np.array([10.0, 1.0, 1.0, 0.2]))
-        *speeds, bits = allocate(u1, x, y, z, 5.324e-5, 8.721e-7, 0.31, 258.0)
-        add("allocation", np.array([*speeds, bits, *wrench(*speeds, 5.324e-5, 8.721e-7, 0.31)]))
+        s_1, s_2, s_3, s_4, bits = allocate(u1, x, y, z, 5.324e-5, 8.721e-7, 0.31, 258.0)
+        back = wrench(s_1, s_2, s_3, s_4, 5.324e-5, 8.721e-7, 0.31)
+        add("allocation", np.array([s_1, s_2, s_3, s_4, bits, *back]))
     return found
 
 

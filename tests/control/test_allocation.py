@@ -75,7 +75,7 @@ def test_priorities(demand: tuple[float, float, float, float]) -> None:
     assert got_u1 == pytest.approx(min(max(u1, least), 4.0 * PAIR_N - least), abs=1e-8)
     if bits & SATURATED_YAW:
         assert abs(got_z) <= abs(z) + 1e-9 or z == pytest.approx(0.0, abs=abs(got_z))
-        # More of it is not to be had: a rotor of the pair that would speed up is at its top, or one that would slow at 0.
+        # No more is to be had: a rotor of the pair that would speed up is at its top, or one that would slow at 0.
         faster, slower = ((0, 2), (1, 3)) if z > got_z else ((1, 3), (0, 2))
         assert any(speeds[i] > TOP - 1e-6 for i in faster) or any(speeds[i] < 1e-3 for i in slower)
     else:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mavsitl_ground.reference import reference_for
 
 from mavsitl.scenario import Figure8, Hover, Reference, ScenarioError, Spiral, Step, Steps, Waypoints
-from mavsitl_ground.reference import reference_for
 
 ROWS = "x,y,z,yaw,hold\n0,0,1,0,2\n# a comment\n\n3,4,1,90\n3,4,1,-170,1\n3,4,6\n"
 
@@ -152,8 +152,8 @@ def test_a_wrong_waypoint_file_is_named_with_row_and_column(tmp_path: Path, text
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match="absent.csv: cannot be read"):
+    with pytest.raises(ScenarioError, match=r"absent\.csv: cannot be read"):
         reference_for(Waypoints(file=str(tmp_path / "absent.csv")))
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(ScenarioError, match="binary.csv: cannot be read"):
+    with pytest.raises(ScenarioError, match=r"binary\.csv: cannot be read"):
         reference_for(Waypoints(file=str(tmp_path / "binary.csv")))

@@ -34,9 +34,7 @@ def frame_v2(
 ) -> bytes:
     """A MAVLink 2 frame with a payload as it stands."""
     message_id: bytes = message_class.id.to_bytes(3, "little")
-    head = bytes((len(payload), incompat, 0, sequence, system_id, component_id)) + message_class.id.to_bytes(
-        3, "little"
-    )
+    head = bytes((len(payload), incompat, 0, sequence, system_id, component_id)) + message_id
     return b"\xfd" + head + payload + checksum(head + payload, message_class.crc_extra) + signature
 
 

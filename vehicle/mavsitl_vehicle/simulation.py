@@ -107,7 +107,9 @@ def _gains(flight: Flight, parameters: Parameters) -> tick.Array:
     gains[tick.ATTITUDE_P : tick.ATTITUDE_P + 3] = p["MC_ROLL_P"], p["MC_PITCH_P"], p["MC_YAW_P"]
     for row, letter in ((tick.RATE_P, "P"), (tick.RATE_I, "I"), (tick.RATE_D, "D")):
         gains[row : row + 3] = [p[f"MC_{axis}RATE_{letter}"] for axis in ("ROLL", "PITCH", "YAW")]
-    gains[tick.RATE_INTEGRAL_LIMIT : tick.RATE_INTEGRAL_LIMIT + 3] = [p[f"MC_{axis}_INT_LIM"] for axis in ("RR", "PR", "YR")]
+    gains[tick.RATE_INTEGRAL_LIMIT : tick.RATE_INTEGRAL_LIMIT + 3] = [
+        p[f"MC_{axis}_INT_LIM"] for axis in ("RR", "PR", "YR")
+    ]
     gains[tick.RATE_MAX : tick.RATE_MAX + 3] = [radians(p[f"MC_{axis}RATE_MAX"]) for axis in ("ROLL", "PITCH", "YAW")]
     gains[tick.YAW_WEIGHT] = p["MC_YAW_WEIGHT"]
     gains[tick.MAX_TORQUE : tick.MAX_TORQUE + 3] = airframe.max_torque_n_m

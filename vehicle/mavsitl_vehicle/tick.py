@@ -5,7 +5,6 @@ Everything random comes in as standard normals, so that a tick is a pure functio
 
 from __future__ import annotations
 
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -81,7 +80,14 @@ def rate_setpoint(demand: Array, estimate: Array, gains: Array, inner: Array, j:
 
 @compiled
 def inner_loops(
-    x: Array, demand: Array, gains: Array, inner: Array, held: NDArray[np.bool_], gyro_normals: Array, dt_s: float, command: Array
+    x: Array,
+    demand: Array,
+    gains: Array,
+    inner: Array,
+    held: NDArray[np.bool_],
+    gyro_normals: Array,
+    dt_s: float,
+    command: Array,
 ) -> None:
     """Rate PID (PX4's form) and allocation (eq 12 inverted) for one physics step: fills `command` (4, n), rotor speeds."""
     for j in range(x.shape[1]):
@@ -107,9 +113,7 @@ def inner_loops(
                 setpoint = inner[RATE_SETPOINT + i, j]
                 error = setpoint - gyro if setpoint == setpoint else 0.0
                 acceleration = (gyro - inner[LAST_GYRO + i, j]) / dt_s
-                value = (
-                    gains[RATE_P + i] * error + inner[RATE_INTEGRAL + i, j] - gains[RATE_D + i] * acceleration
-                )
+                value = gains[RATE_P + i] * error + inner[RATE_INTEGRAL + i, j] - gains[RATE_D + i] * acceleration
                 if not held[j]:
                     limit = gains[RATE_INTEGRAL_LIMIT + i]
                     integral = inner[RATE_INTEGRAL + i, j] + gains[RATE_I + i] * error * dt_s

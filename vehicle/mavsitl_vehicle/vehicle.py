@@ -105,7 +105,11 @@ class Vehicle:
     def _inner_law(self, setpoint: Setpoint | None) -> Setpoint | None:
         """With the PIDNN aboard, an attitude setpoint becomes a torque by it; all else passes."""
         law = self._seated
-        if law is None or not isinstance(setpoint, AttitudeSetpoint) or self.autopilot.commander.mode is not Mode.OFFBOARD:
+        if (
+            law is None
+            or not isinstance(setpoint, AttitudeSetpoint)
+            or self.autopilot.commander.mode is not Mode.OFFBOARD
+        ):
             return setpoint
         if self.autopilot.released_us is None:
             law.reset()
@@ -173,5 +177,3 @@ class _Record:
 def build(flight: Flight, recorder: Recorder, **options: Any) -> Vehicle:
     """The entry point `mavsitl.vehicle`: a vehicle core for the bridge's drivers."""
     return Vehicle(flight, recorder, **options)
-
-

@@ -240,9 +240,7 @@ class Autopilot:
             thrust = self.setpoint.thrust if self.setpoint is not None else 0.0
             ready = commander.spooled_up(now_us) and commander.mode is Mode.OFFBOARD
             if ready and thrust >= TAKEOFF_THRUST_SHARE * self._hover_thrust:
-                self.landed_state = (
-                    mavlink.MAV_LANDED_STATE_IN_AIR if self.held else mavlink.MAV_LANDED_STATE_TAKEOFF
-                )
+                self.landed_state = mavlink.MAV_LANDED_STATE_IN_AIR if self.held else mavlink.MAV_LANDED_STATE_TAKEOFF
                 self.held = False
                 self.released_us = now_us
                 self._still_since_us = None
@@ -285,4 +283,3 @@ class Autopilot:
 
     def _queue_text(self, severity: int, text: str) -> None:
         self._texts.append((severity, text))
-

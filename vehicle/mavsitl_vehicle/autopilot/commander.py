@@ -10,10 +10,10 @@ from mavsitl_vehicle.autopilot import modes
 from mavsitl_vehicle.autopilot.modes import Mode
 from mavsitl_vehicle.autopilot.parameters import Parameters
 
-ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
-TEMPORARILY_REJECTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
-DENIED = mavlink.MAV_RESULT_DENIED
-UNSUPPORTED = mavlink.MAV_RESULT_UNSUPPORTED
+ACCEPTED: int = mavlink.MAV_RESULT_ACCEPTED
+TEMPORARILY_REJECTED: int = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+DENIED: int = mavlink.MAV_RESULT_DENIED
+UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 
 FORCE_MAGIC = (21196, 2989)
 """param2 of MAV_CMD_COMPONENT_ARM_DISARM that forces: PX4's number, and the one that MAVProxy and QGroundControl send."""

@@ -25,7 +25,9 @@ class ModeInfo(NamedTuple):
     can_arm: bool
 
 
-_AUTO_FLAGS = mavlink.MAV_MODE_FLAG_AUTO_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED | mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
+_AUTO_FLAGS = (
+    mavlink.MAV_MODE_FLAG_AUTO_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED | mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
+)
 
 TABLE: dict[Mode, ModeInfo] = {
     Mode.LOITER: ModeInfo("AUTO.LOITER", 4, 3, 4, _AUTO_FLAGS, True),

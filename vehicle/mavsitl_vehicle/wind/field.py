@@ -58,38 +58,44 @@ def wind_step(state: Array, coefficients: Array, normals: Array, time_s: float, 
 
     row = 0
     for k in range(coefficients.shape[0]):
-        c = coefficients[k]
-        model = c[MODEL]
-        to_x, to_y, to_z = c[DIRECTION], c[DIRECTION + 1], c[DIRECTION + 2]
+        model = coefficients[k, MODEL]
+        to_x, to_y, to_z = coefficients[k, DIRECTION], coefficients[k, DIRECTION + 1], coefficients[k, DIRECTION + 2]
         if model < FIRST_ORDER:
             share = 1.0
             if model != STEADY:
-                share = gust_share(time_s, c[GUST_START], c[GUST_LENGTH], model == GUST_PULSE)
+                share = gust_share(
+                    time_s, coefficients[k, GUST_START], coefficients[k, GUST_LENGTH], model == GUST_PULSE
+                )
             for j in range(n):
                 wind_nwu_m_s[0, j] += to_x * share
                 wind_nwu_m_s[1, j] += to_y * share
                 wind_nwu_m_s[2, j] += to_z * share
         elif model == FIRST_ORDER:
+            decay, noise, out = coefficients[k, DECAY], coefficients[k, NOISE_11], coefficients[k, OUT_1]
             for j in range(n):
                 s = state[row, j]
-                speed = c[OUT_1] * s
+                speed = out * s
                 wind_nwu_m_s[0, j] += to_x * speed
                 wind_nwu_m_s[1, j] += to_y * speed
                 wind_nwu_m_s[2, j] += to_z * speed
-                state[row, j] = c[DECAY] * s + c[NOISE_11] * normals[row, j]
+                state[row, j] = decay * s + noise * normals[row, j]
             row += 1
         else:
+            decay, cross = coefficients[k, DECAY], coefficients[k, CROSS]
+            noise_11, noise_21 = coefficients[k, NOISE_11], coefficients[k, NOISE_21]
+            noise_22 = coefficients[k, NOISE_22]
+            out_1, out_2 = coefficients[k, OUT_1], coefficients[k, OUT_2]
             for j in range(n):
                 s_1 = state[row, j]
                 s_2 = state[row + 1, j]
-                speed = c[OUT_1] * s_1 + c[OUT_2] * s_2
+                speed = out_1 * s_1 + out_2 * s_2
                 wind_nwu_m_s[0, j] += to_x * speed
                 wind_nwu_m_s[1, j] += to_y * speed
                 wind_nwu_m_s[2, j] += to_z * speed
                 xi_1 = normals[row, j]
                 xi_2 = normals[row + 1, j]
-                state[row, j] = c[DECAY] * s_1 + c[NOISE_11] * xi_1
-                state[row + 1, j] = c[CROSS] * s_1 + c[DECAY] * s_2 + c[NOISE_21] * xi_1 + c[NOISE_22] * xi_2
+                state[row, j] = decay * s_1 + noise_11 * xi_1
+                state[row + 1, j] = cross * s_1 + decay * s_2 + noise_21 * xi_1 + noise_22 * xi_2
             row += 2
 
 

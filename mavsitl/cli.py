@@ -1,0 +1,586 @@
+"""The commands. The only place that prints."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import tomllib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavsitl import __version__
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
+
+    from mavsitl.ends import Outcome
+    from mavsitl.report.run import FlightRecord
+    from mavsitl.scenario import Flight
+
+PAPER_SCENARIOS = ("hover-calm", "hover-wind", "spiral-calm", "spiral-wind")
+
+EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
+
+DESCRIPTION = """\
+A quadrotor in Dryden wind and an off-board controller, two processes that meet on MAVLink 2 over UDP alone.
+
+  mavsitl fly          fly the paper's four experiments and write a report
+  mavsitl vehicle      a vehicle alone, in real time, on PX4 SITL's ports
+  mavsitl ground       the paper's controller alone, for that vehicle or any PX4-like one
+"""
+
+EPILOG = """\
+Exit codes: 0 done; 1 the run failed (the message says which end and why); 2 wrong arguments or scenario; 130 interrupted.
+Documentation: docs/index.md. Each command's own --help says more.
+"""
+
+FLY_HELP = """\
+Fly scenarios: for each, a vehicle process and a ground process are started, connected over UDP on loopback, and run in
+lock-step faster than real time. Without a scenario the paper's four experiments are flown: hover and spiral, each in calm
+air and in Dryden wind.
+
+The run folder gets, for each flight, vehicle.ulg and ground.ulg (PX4's log format), link.tlog (every datagram), and for
+all together run.json and report.html, one self-contained page.
+"""
+
+FLY_EXAMPLES = """\
+examples:
+  mavsitl fly                                        the paper's four experiments
+  mavsitl fly hover-wind --law pid                   one of them with the plain PID
+  mavsitl fly my.toml --seed 7 --level attitude      a file of your own
+  mavsitl fly hover-wind --set noise.position_m=0.02 --set offnominal.mass_scale=1.3
+  mavsitl fly --in-memory                            one process, no sockets, the same bytes
+"""
+
+VEHICLE_HELP = """\
+A simulated PX4-like vehicle in real time. Like PX4 SITL it binds UDP 18570 and sends to 14550 (ground stations), binds
+14580 and sends to 14540 (off-board and companion computers), and speaks first. Whoever sends a valid MAVLink frame to
+either port is answered too. It binds loopback; --bind opens it to a network, where plain MAVLink has no authentication:
+everybody who can reach the port can fly the vehicle.
+"""
+
+VEHICLE_EXAMPLES = """\
+examples:
+  mavsitl vehicle                                    hover-calm's vehicle and air, on PX4's ports
+  mavsitl vehicle hover-wind --instance 1            a second one: ports 18571, 14581, system id 2
+  mavsitl vehicle hover-wind --bind 0.0.0.0 --offboard-remote 192.0.2.7:14540
+"""
+
+GROUND_HELP = """\
+The paper's off-board controller in real time. It waits for a vehicle, streams setpoints, asks for OFFBOARD, arms, flies
+the scenario's reference, and lands or disarms. A vehicle that falls silent or restarts is waited for and flown again.
+"""
+
+GROUND_EXAMPLES = """\
+examples:
+  mavsitl ground hover-wind                          listens on udpin:127.0.0.1:14540, as PX4's users expect
+  mavsitl ground hover-wind --link udpin:0.0.0.0:14540
+  mavsitl ground spiral-calm --link udpout:192.0.2.9:14580 --system 3
+"""
+
+
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=32, width=110)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The `mavsitl` command; returns its exit code."""
+    parser = build_parser()
+    options = parser.parse_args(arguments)
+    run: Callable[[argparse.Namespace], int] | None = getattr(options, "run", None)
+    if run is None:
+        parser.print_help()
+        return EXIT_USAGE
+    from mavsitl.link.address import AddressError
+    from mavsitl.link.base import LinkError
+    from mavsitl.log.ulog import LogError
+    from mavsitl.pair import PairError
+    from mavsitl.report.run import RunError
+    from mavsitl.scenario import ScenarioError
+    from mavsitl.wings import WingError
+
+    try:
+        return run(options)
+    except (ScenarioError, AddressError, WingError) as error:
+        print(f"mavsitl {options.command}: {error}", file=sys.stderr)
+        return EXIT_USAGE
+    except (LinkError, LogError, PairError, RunError) as error:
+        print(f"mavsitl {options.command}: {error}", file=sys.stderr)
+        return EXIT_FAILED
+    except KeyboardInterrupt:
+        print(f"mavsitl {options.command}: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output went away; point stdout elsewhere so that the interpreter's last flush is quiet.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_FAILED
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line; the reference page of the docs is made from it."""
+    parser = argparse.ArgumentParser("mavsitl", description=DESCRIPTION, epilog=EPILOG, formatter_class=_Formatter)
+    parser.add_argument("--version", action="version", version=f"mavsitl {__version__}")
+    commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
+    _add_fly(commands)
+    _add_vehicle(commands)
+    _add_ground(commands)
+    _add_report(commands)
+    _add_scenarios(commands)
+    return parser
+
+
+def _command(commands: Any, name: str, summary: str, description: str, epilog: str = "") -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=summary, description=description, epilog=epilog, formatter_class=_Formatter
+    )
+    return parser
+
+
+def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("scenario")
+    group.add_argument("--seed", type=int, metavar="N", help="seed of wind and noise (scenario key: seed)")
+    group.add_argument("--airframe", metavar="NAME", help="paper, realistic or a .toml file (airframe)")
+    group.add_argument("--law", choices=("pidnn", "pid"), help="attitude law (controller.law)")
+    group.add_argument("--level", choices=("attitude", "body_rate", "torque"), help="command level (controller.level)")
+    group.add_argument(
+        "--wind-information",
+        choices=("oracle", "observer", "none"),
+        help="source of W1..W3 (controller.wind_information)",
+    )
+    group.add_argument("--duration", type=float, metavar="S", help="flight time in seconds (duration_s)")
+    group.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
+        help="any key of the scenario, dotted, with a TOML value; may be repeated",
+    )  # fmt: skip
+
+
+def _add_fly(commands: Any) -> None:
+    parser = _command(
+        commands, "fly", "fly scenarios with two processes in lock-step, and report", FLY_HELP, FLY_EXAMPLES
+    )
+    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="a shipped scenario's name or a .toml file")
+    _add_scenario_options(parser)
+    group = parser.add_argument_group("run")
+    group.add_argument("--run-dir", type=Path, metavar="DIR", help="run folder (default: runs/<UTC time>)")
+    group.add_argument("--in-memory", action="store_true", help="both ends in one process, no sockets; the same bytes")
+    group.add_argument("--no-report", action="store_true", help="logs and tables only")
+    group.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
+    parser.set_defaults(run=_fly)
+
+
+def _add_vehicle(commands: Any) -> None:
+    parser = _command(commands, "vehicle", "start a vehicle alone", VEHICLE_HELP, VEHICLE_EXAMPLES)
+    parser.add_argument(
+        "scenario",
+        nargs="?",
+        default="hover-calm",
+        metavar="SCENARIO",
+        help="its airframe, air, start (default: hover-calm)",
+    )
+    _add_scenario_options(parser)
+    group = parser.add_argument_group("link")
+    group.add_argument(
+        "--instance",
+        type=int,
+        default=0,
+        metavar="I",
+        help="adds I to the ports and to the system id, as PX4's instances",
+    )
+    group.add_argument("--system", type=int, metavar="ID", help="MAVLink system id, 1 to 255 (default: instance + 1)")
+    group.add_argument(
+        "--bind", default="127.0.0.1", metavar="HOST", help="local address of both links (default: 127.0.0.1)"
+    )
+    group.add_argument(
+        "--offboard-port", type=int, metavar="N", help="local port of the off-board link (default: 14580 + I)"
+    )
+    group.add_argument(
+        "--offboard-remote", metavar="HOST:PORT", help="where it sends first (default: 127.0.0.1:14540 + I)"
+    )
+    group.add_argument(
+        "--gcs-port", type=int, metavar="N", help="local port of the ground-station link (default: 18570 + I)"
+    )
+    group.add_argument("--gcs-remote", metavar="HOST:PORT", help="where it sends first (default: 127.0.0.1:14550)")
+    _add_end_options(parser)
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="simulated over wall time (default: 1)")
+    parser.add_argument("--until-disarmed", action="store_true", help="end after the first flight")
+    parser.set_defaults(run=_vehicle)
+
+
+def _add_ground(commands: Any) -> None:
+    parser = _command(commands, "ground", "start the off-board controller alone", GROUND_HELP, GROUND_EXAMPLES)
+    parser.add_argument(
+        "scenario",
+        nargs="?",
+        default="hover-calm",
+        metavar="SCENARIO",
+        help="its controller and reference (default: hover-calm)",
+    )
+    _add_scenario_options(parser)
+    group = parser.add_argument_group("link")
+    group.add_argument(
+        "--link",
+        default="udpin:127.0.0.1:14540",
+        metavar="ENDPOINT",
+        help="udpin:HOST:PORT or udpout:HOST:PORT (default: udpin:127.0.0.1:14540)",
+    )
+    group.add_argument(
+        "--system", type=int, metavar="ID", help="fly only the vehicle with this system id (default: the first heard)"
+    )
+    group.add_argument(
+        "--vehicle",
+        metavar="HOST:PORT",
+        default="127.0.0.1:14580",
+        help="lock-step only: the vehicle's off-board port (default: 127.0.0.1:14580)",
+    )
+    _add_end_options(parser)
+    parser.set_defaults(run=_ground)
+
+
+def _add_end_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("run")
+    group.add_argument(
+        "--lockstep", action="store_true", help="simulated time, with a partner that also runs --lockstep"
+    )
+    group.add_argument(
+        "--deadline",
+        type=float,
+        default=10.0,
+        metavar="S",
+        help="lock-step: a partner silent for so long is an error (default: 10)",
+    )
+    group.add_argument(
+        "--cpu",
+        type=int,
+        metavar="N",
+        help="lock-step: run on this CPU from the first exchange on; the same for both is fastest",
+    )
+    group.add_argument("--run-dir", type=Path, metavar="DIR", help="write logs there (default: none)")
+    group.add_argument("--wing", metavar="NAME", help="another installed vehicle or controller, by its entry point")
+    group.add_argument(
+        "--status", choices=("text", "json"), default="text", help="json: one object a line on stdout, for programs"
+    )
+
+
+def _add_report(commands: Any) -> None:
+    parser = _command(
+        commands, "report", "draw the report of runs again", "Draw report.html of each run folder again, from its logs."
+    )
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run folder, with run.json in it")
+    parser.set_defaults(run=_report)
+
+
+def _add_scenarios(commands: Any) -> None:
+    parser = _command(
+        commands, "scenarios", "list the shipped scenarios", "List the shipped scenarios with what they fly."
+    )
+    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.set_defaults(run=_scenarios)
+
+
+# --- commands ----------------------------------------------------------------------------------------------------------
+
+
+def _settings(options: argparse.Namespace) -> list[str]:
+    """All scenario options as KEY=VALUE, the form in which they are handed on to the processes."""
+    settings = list(options.settings)
+    named = {
+        "seed": options.seed, "airframe": options.airframe, "controller.law": options.law, "controller.level": options.level,
+        "controller.wind_information": options.wind_information, "duration_s": options.duration,
+    }  # fmt: skip
+    for key, value in named.items():
+        if value is not None:
+            settings.append(f'{key}="{value}"' if isinstance(value, str) else f"{key}={value}")
+    return settings
+
+
+def _load(name: str, settings: Sequence[str]) -> Flight:
+    from mavsitl import scenario
+
+    overrides: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not key:
+            raise scenario.ScenarioError(f"--set {setting}: not KEY=VALUE")
+        try:
+            overrides[key.strip()] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            overrides[key.strip()] = text
+    return scenario.load(name, overrides)
+
+
+def _endpoint(text: str, option: str) -> tuple[str, int]:
+    from mavsitl.link.address import AddressError, parse_address
+
+    try:
+        address = parse_address(f"udpout:{text}")
+    except AddressError as error:
+        raise AddressError(f"{option} {text}: not HOST:PORT ({error})") from error
+    return address.host, address.port
+
+
+def _fly(options: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from mavsitl import pair
+    from mavsitl.clock import utc_stamp
+    from mavsitl.report import run as runs
+
+    settings = _settings(options)
+    names = options.scenarios or list(PAPER_SCENARIOS)
+    flights = [_load(name, settings) for name in names]
+    created = utc_stamp()
+    folder: Path = options.run_dir or Path("runs") / created.replace(":", "").replace("-", "")
+    console = Console(stderr=options.json)
+    records: list[FlightRecord] = []
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[said]}"), TimeElapsedColumn(),
+        console=console, disable=not console.is_terminal,
+    )  # fmt: skip
+    try:
+        with bar:
+            for index, (name, flight) in enumerate(zip(names, flights, strict=True)):
+                title = flight.name if names.count(name) == 1 else f"{flight.name}-{index + 1}"
+                task = bar.add_task(f"{title:20s}", total=flight.scenario.duration_s, said="starting")
+                outcome, speed = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task, pair)
+                records.append(runs.record(flight, folder=title, wire_hash=outcome, real_time_factor=speed))
+                runs.write_run(folder, runs.new_run("mavsitl " + " ".join(sys.argv[1:]), created, tuple(records)))
+    except KeyboardInterrupt:
+        console.print(f"interrupted; the logs so far are in {folder}")
+        raise
+    return _show(console, options, folder, records)
+
+
+def _fly_one(
+    name: str, flight: Flight, settings: list[str], folder: Path, memory: bool, bar: RichProgress, task: Any, pair: Any
+) -> tuple[str, float]:
+    """One flight; the hash of its wire and how much faster than real time it went."""
+
+    def move(time_s: float) -> None:
+        bar.update(task, completed=max(time_s, 0.0), said=f"{max(time_s, 0.0):5.1f} s")
+
+    def on_event(end: str, event: dict[str, Any]) -> None:
+        if event["event"] == "progress" and end == "vehicle":
+            move(event["flight_time_s"])
+        elif event["event"] == "report":
+            bar.update(task, said=event["text"])
+
+    if memory:
+        from mavsitl import ends
+
+        outcome = ends.in_memory(flight, folder, report=lambda text: bar.update(task, said=text), progress=move)
+        wire_hash, speed = outcome.wire_hash, outcome.speed
+    else:
+        result = pair.fly(name, settings, folder, on_event)
+        wire_hash, speed = result.vehicle["wire_hash"], result.vehicle["speed"]
+    bar.update(task, completed=flight.scenario.duration_s, said=f"{speed:.0f} x real time")
+    return wire_hash, speed
+
+
+def _show(console: Any, options: argparse.Namespace, folder: Path, records: list[FlightRecord]) -> int:
+    from rich.table import Table
+
+    from mavsitl.log.flight import FlightData
+    from mavsitl.report import tables
+    from mavsitl.report.metrics import rmse
+
+    results = []
+    for record in records:
+        data = FlightData.from_folder(folder / record.folder, duration_s=record.duration_s)
+        rows = tables.rows(rmse(data), record.paper_case)
+        results.append((record, rows))
+    if options.json:
+        _print_json(folder, results)
+    else:
+        for record, rows in results:
+            facts = (
+                f"{record.law}, {record.level}, wind information: {_loud(record.wind_information)}, seed {record.seed}"
+            )
+            table = Table(title=f"{record.title}  ({facts})", title_justify="left", title_style="bold")
+            for column in ("RMSE", "ours", "paper", "ours / paper"):
+                table.add_column(column, justify="left" if column == "RMSE" else "right")
+            for row in rows:
+                paper = "" if row.paper is None else tables.number(row.paper)
+                ratio = (
+                    "" if row.ratio is None or row.verdict is None else f"{row.ratio:.2f} {tables.SYMBOLS[row.verdict]}"
+                )
+                style = {"beaten": "green", "met": "green", "missed": "yellow"}.get(row.verdict or "", "")
+                table.add_row(row.state, tables.number(row.ours), paper, f"[{style}]{ratio}[/]" if style else ratio)
+            console.print(table)
+    if not options.no_report:
+        from mavsitl.report.html import write_report
+
+        page = write_report(folder)
+        console.print(f"report: {page}", soft_wrap=True, highlight=False)
+    console.print(f"logs:   {folder}", soft_wrap=True, highlight=False)
+    return EXIT_OK
+
+
+def _loud(source: str) -> str:
+    return "ORACLE (true wind)" if source == "oracle" else source
+
+
+def _print_json(folder: Path, results: list[Any]) -> None:
+    import msgspec
+
+    flights = [
+        {
+            "flight": record,
+            "rmse": [{"state": row.state, "ours": row.ours, "paper": row.paper, "ratio": row.ratio} for row in rows],
+        }
+        for record, rows in results
+    ]
+    print(msgspec.json.format(msgspec.json.encode({"folder": str(folder), "flights": flights}), indent=2).decode())
+
+
+class _Status:
+    """What an end tells while it runs: lines for a person, or JSON objects for a program. Also its stop flag."""
+
+    def __init__(self, as_json: bool) -> None:
+        self._as_json = as_json
+        self.stopped = False
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, self._stop)
+
+    def _stop(self, number: int, frame: Any) -> None:
+        if self.stopped:
+            raise KeyboardInterrupt
+        self.stopped = True
+
+    def stop(self) -> bool:
+        return self.stopped
+
+    def progress(self, flight_time_s: float) -> None:
+        if self.stopped:
+            raise KeyboardInterrupt
+        if self._as_json:
+            self._print({"event": "progress", "flight_time_s": flight_time_s})
+
+    def say(self, text: str) -> None:
+        if self._as_json:
+            self._print({"event": "report", "text": text})
+        else:
+            print(text, flush=True)
+
+    def end(self, outcome: Outcome) -> None:
+        if self._as_json:
+            self._print({
+                "event": "end", "simulated_s": outcome.simulated_s, "wall_s": outcome.wall_s, "speed": outcome.speed,
+                "wire_hash": outcome.wire_hash, "finished": outcome.finished, "frames": outcome.frames, "rejected": outcome.rejected,
+            })  # fmt: skip
+            return
+        print(
+            f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time; {outcome.frames} frames in"
+        )
+        if outcome.rejected:
+            print(f"{outcome.rejected} bad frames were dropped")
+        if outcome.lateness_us is not None:
+            p50, p99 = outcome.lateness_us
+            print(f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; schedule moved {outcome.rebased} times")
+
+    def _print(self, event: dict[str, Any]) -> None:
+        import msgspec
+
+        sys.stdout.write(msgspec.json.encode(event).decode() + "\n")
+        sys.stdout.flush()
+
+
+def _vehicle(options: argparse.Namespace) -> int:
+    from mavsitl import ends
+
+    flight = _load(options.scenario, _settings(options))
+    instance = options.instance
+    system_id = options.system if options.system is not None else instance + 1
+    if not 1 <= system_id <= 255:
+        from mavsitl.scenario import ScenarioError
+
+        raise ScenarioError(f"--system {system_id}: allowed: 1 to 255")
+    offboard_remote = options.offboard_remote or f"127.0.0.1:{ends.OFFBOARD_REMOTE_PORT + instance}"
+    links = ends.VehicleLinks(
+        bind=options.bind,
+        offboard_port=options.offboard_port if options.offboard_port is not None else ends.OFFBOARD_PORT + instance,
+        offboard_remote=_endpoint(offboard_remote, "--offboard-remote"),
+        gcs_port=options.gcs_port if options.gcs_port is not None else ends.GCS_PORT + instance,
+        gcs_remote=_endpoint(options.gcs_remote or f"127.0.0.1:{ends.GCS_REMOTE_PORT}", "--gcs-remote"),
+    )
+    status = _Status(options.status == "json")
+    if options.lockstep:
+        outcome = ends.vehicle_lockstep(
+            flight,
+            links,
+            options.run_dir,
+            system_id=system_id,
+            wing=options.wing,
+            deadline_s=options.deadline,
+            cpu=options.cpu,
+            progress=status.progress,
+        )
+    else:
+        status.say(
+            f"vehicle {system_id} ({flight.name}): off-board {links.bind}:{links.offboard_port} -> {offboard_remote}, "
+            f"ground station {links.bind}:{links.gcs_port} -> {links.gcs_remote[0]}:{links.gcs_remote[1]}; Ctrl-C ends it"
+        )
+        outcome = ends.vehicle_realtime(
+            flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed,
+            until_finished=options.until_disarmed, stop=status.stop, progress=None,
+        )  # fmt: skip
+    status.end(outcome)
+    return EXIT_OK
+
+
+def _ground(options: argparse.Namespace) -> int:
+    from mavsitl import ends
+    from mavsitl.link.address import parse_address
+
+    flight = _load(options.scenario, _settings(options))
+    address = parse_address(options.link)
+    status = _Status(options.status == "json")
+    if options.lockstep:
+        remote = _endpoint(options.vehicle, "--vehicle")
+        outcome = ends.ground_lockstep(
+            flight, (address.host, address.port), remote, options.run_dir,
+            wing=options.wing, deadline_s=options.deadline, cpu=options.cpu, report=status.say, progress=status.progress,
+        )  # fmt: skip
+    else:
+        status.say(f"ground ({flight.name}): waiting for a vehicle on {address}; Ctrl-C ends it")
+        outcome = ends.ground_realtime(
+            flight, address, options.run_dir,
+            vehicle_system_id=options.system, wing=options.wing, report=status.say, stop=status.stop, progress=None,
+        )  # fmt: skip
+    status.end(outcome)
+    return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED
+
+
+def _report(options: argparse.Namespace) -> int:
+    from mavsitl.report.html import write_report
+
+    for folder in options.runs:
+        print(write_report(folder))
+    return EXIT_OK
+
+
+def _scenarios(options: argparse.Namespace) -> int:
+    from mavsitl import scenario
+
+    flights = [scenario.load(name) for name in scenario.names()]
+    if options.json:
+        import msgspec
+
+        print(msgspec.json.format(msgspec.json.encode({f.name: f.scenario for f in flights}), indent=2).decode())
+        return EXIT_OK
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("scenario", "title", "airframe", "wind", "reference", "level")
+    for flight in flights:
+        s = flight.scenario
+        wind = " + ".join(str(model.__struct_config__.tag) for model in s.wind) or "calm"
+        table.add_row(
+            flight.name, s.title, s.airframe, wind, str(s.reference.__struct_config__.tag), s.controller.level
+        )
+    Console().print(table)
+    return EXIT_OK

@@ -1,0 +1,250 @@
+"""One end of a flight as a process runs it: its core, its link, its log files and its driver, put together and closed again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mavsitl import __version__, drivers, wings
+from mavsitl.clock import monotonic_us
+from mavsitl.drivers import Progress, Tap
+from mavsitl.link.address import Address
+from mavsitl.link.base import Link
+from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink, open_link
+from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
+from mavsitl.log.tlog import TlogWriter
+from mavsitl.log.ulog import Recorder, UlogWriter
+from mavsitl.scenario import Flight
+
+WIRE_LOG = "link.tlog"
+
+GCS_PORT, GCS_REMOTE_PORT = 18570, 14550
+OFFBOARD_PORT, OFFBOARD_REMOTE_PORT = 14580, 14540
+"""PX4 SITL's: each is raised by the instance."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an end has to say when it is over."""
+
+    simulated_s: float
+    wall_s: float
+    wire_hash: str
+    finished: bool
+    """The flight came to its end, rather than being stopped."""
+    frames: int
+    """Valid frames received."""
+    rejected: int
+    """Bytes that looked like frames and were not."""
+    lateness_us: tuple[float, float] | None = None
+    """p50 and p99 of the tick's lateness; real time only."""
+    rebased: int = 0
+
+    @property
+    def speed(self) -> float:
+        """Simulated over wall time."""
+        return self.simulated_s / self.wall_s if self.wall_s > 0.0 else 0.0
+
+
+@contextmanager
+def _logs(folder: Path | None, log_name: str, flight: Flight, with_wire: bool) -> Iterator[tuple[Recorder, Tap]]:
+    """Recorder and tap of an end. Without a folder the rows are dropped as they come."""
+    if folder is None:
+        yield NullRecorder(), Tap()
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    info = {"sys_name": "mavsitl", "ver_sw": __version__, "scenario": flight.name}
+    parameters = flight.airframe.parameters | flight.scenario.parameters
+    with UlogWriter(folder / log_name, info, parameters) as writer:
+        tlog = TlogWriter(folder / WIRE_LOG) if with_wire else None
+        try:
+            yield writer, Tap(tlog=tlog, flush=writer.flush)
+        finally:
+            if tlog is not None:
+                tlog.close()
+
+
+class _NullRows:
+    __slots__ = ()
+
+    def append(self, timestamp_us: int, *values: float) -> None:
+        pass
+
+
+class NullRecorder:
+    """Keeps nothing: for an end that runs without a folder."""
+
+    def topic(self, topic: Any) -> Any:
+        return _NullRows()
+
+    def message(self, timestamp_us: int, level: int, text: str) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class VehicleLinks:
+    """Where the vehicle binds and sends. `bind` is loopback unless told otherwise."""
+
+    bind: str = LOOPBACK
+    offboard_port: int = OFFBOARD_PORT
+    offboard_remote: tuple[str, int] = (LOOPBACK, OFFBOARD_REMOTE_PORT)
+    gcs_port: int = GCS_PORT
+    gcs_remote: tuple[str, int] = (LOOPBACK, GCS_REMOTE_PORT)
+
+
+def vehicle_lockstep(
+    flight: Flight,
+    links: VehicleLinks,
+    folder: Path | None,
+    *,
+    system_id: int,
+    wing: str | None,
+    deadline_s: float,
+    cpu: int | None,
+    progress: Progress | None,
+) -> Outcome:
+    """The vehicle in lock-step over UDP with one ground. Raises `LinkError`, `ScenarioError`, `LogError`."""
+    link = ConnectedUdp(
+        links.offboard_remote, (links.bind, links.offboard_port), timeout_s=drivers.FIRST_REPEAT_S,
+        port_option="--offboard-port N", host_option="--bind HOST",
+    )  # fmt: skip
+    try:
+        with _logs(folder, VEHICLE_LOG, flight, with_wire=True) as (recorder, tap):
+            build = wings.find(wings.VEHICLE_GROUP, wing)
+            core = build(
+                flight, recorder, seed=flight.scenario.seed, system_id=system_id, ports=("offboard",), lockstep=True
+            )
+            watch = _Watch(core)
+            end_us = drivers.run_lockstep_vehicle(core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress)
+            return watch.outcome(end_us, tap)
+    finally:
+        link.close()
+
+
+def ground_lockstep(
+    flight: Flight, bind: tuple[str, int], remote: tuple[str, int], folder: Path | None, *,
+    wing: str | None, deadline_s: float, cpu: int | None, report: Callable[[str], None], progress: Progress | None,
+) -> Outcome:  # fmt: skip
+    """The ground in lock-step over UDP with one vehicle. Raises as `vehicle_lockstep`."""
+    link = ConnectedUdp(
+        remote,
+        bind,
+        timeout_s=drivers.FIRST_REPEAT_S,
+        port_option="--link udpin:HOST:PORT",
+        host_option="--link udpin:HOST:PORT",
+    )
+    try:
+        with _logs(folder, GROUND_LOG, flight, with_wire=False) as (recorder, tap):
+            core = wings.find(wings.GROUND_GROUP, wing)(flight, recorder, report=report)
+            watch = _Watch(core)
+            end_us = drivers.run_lockstep_ground(core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress)
+            return watch.outcome(end_us, tap)
+    finally:
+        link.close()
+
+
+def vehicle_realtime(
+    flight: Flight, links: VehicleLinks, folder: Path | None, *,
+    system_id: int, wing: str | None, speed: float, until_finished: bool, stop: Callable[[], bool], progress: Progress | None,
+) -> Outcome:  # fmt: skip
+    """The vehicle on the wall clock, with PX4 SITL's two links. Raises as `vehicle_lockstep`."""
+    opened: list[Link] = []
+    try:
+        opened.append(
+            UdpLink(
+                (links.bind, links.offboard_port),
+                links.offboard_remote,
+                port_option="--offboard-port N",
+                host_option="--bind HOST",
+            )
+        )
+        opened.append(
+            UdpLink(
+                (links.bind, links.gcs_port), links.gcs_remote, port_option="--gcs-port N", host_option="--bind HOST"
+            )
+        )
+        with _logs(folder, VEHICLE_LOG, flight, with_wire=True) as (recorder, tap):
+            build = wings.find(wings.VEHICLE_GROUP, wing)
+            core = build(
+                flight,
+                recorder,
+                seed=flight.scenario.seed,
+                system_id=system_id,
+                ports=("offboard", "gcs"),
+                lockstep=False,
+            )
+            watch = _Watch(core)
+            timing = drivers.run_realtime_vehicle(
+                core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, progress=progress
+            )
+            lateness = (timing.lateness.p50_us, timing.lateness.p99_us)
+            return watch.outcome(timing.simulated_us, tap, lateness, timing.rebased)
+    finally:
+        for link in opened:
+            link.close()
+
+
+def ground_realtime(
+    flight: Flight, address: Address, folder: Path | None, *,
+    vehicle_system_id: int | None, wing: str | None, report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
+) -> Outcome:  # fmt: skip
+    """The ground on the wall clock, on any endpoint. Raises as `vehicle_lockstep`."""
+    link = open_link(address, port_option="--link udpin:HOST:PORT", host_option="--link udpin:HOST:PORT")
+    try:
+        with _logs(folder, GROUND_LOG, flight, with_wire=False) as (recorder, tap):
+            build = wings.find(wings.GROUND_GROUP, wing)
+            core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
+            watch = _Watch(core)
+            drivers.run_realtime_ground(core, link, tap, stop=stop, progress=progress)
+            return watch.outcome(max(core.vehicle_time_us, 0), tap)
+    finally:
+        link.close()
+
+
+def in_memory(
+    flight: Flight, folder: Path | None, *, report: Callable[[str], None], progress: Progress | None
+) -> Outcome:
+    """Both ends in this process; the same bytes as in lock-step over UDP."""
+    with (
+        _logs(folder, VEHICLE_LOG, flight, with_wire=True) as (vehicle_recorder, tap),
+        _logs(folder, GROUND_LOG, flight, with_wire=False) as (ground_recorder, ground_tap),
+    ):
+        vehicle_flush, ground_flush = tap.flush, ground_tap.flush
+
+        def flush(now_us: int) -> None:
+            for each in (vehicle_flush, ground_flush):
+                if each is not None:
+                    each(now_us)
+
+        tap.flush = flush
+        vehicle = wings.find(wings.VEHICLE_GROUP)(flight, vehicle_recorder, seed=flight.scenario.seed, lockstep=True)
+        ground = wings.find(wings.GROUND_GROUP)(flight, ground_recorder, report=report)
+        watch = _Watch(vehicle)
+        end_us = drivers.fly_in_memory(vehicle, ground, tap, progress=progress)
+        return watch.outcome(end_us, tap)
+
+
+class _Watch:
+    """Wall time of a run, from the construction of its core: set-up and compilation are not counted as flying."""
+
+    def __init__(self, core: Any) -> None:
+        self._core = core
+        self._start_us = monotonic_us()
+
+    def outcome(
+        self, simulated_us: int, tap: Tap, lateness_us: tuple[float, float] | None = None, rebased: int = 0
+    ) -> Outcome:
+        counters = self._core.counters
+        return Outcome(
+            simulated_s=simulated_us / 1e6,
+            wall_s=(monotonic_us() - self._start_us) / 1e6,
+            wire_hash=tap.wire.hexdigest(),
+            finished=self._core.finished,
+            frames=counters.frames,
+            rejected=counters.rejected,
+            lateness_us=lateness_us,
+            rebased=rebased,
+        )
