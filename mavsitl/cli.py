@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -33,14 +34,15 @@ A quadrotor in Dryden wind and an off-board controller, two processes that meet 
 """
 
 EPILOG = """\
-Exit codes: 0 done; 1 the run failed (the message says which end and why); 2 wrong arguments or scenario; 130 interrupted.
+Exit codes: 0 done; 1 the run failed (the message says which end and why); 2 wrong arguments or scenario;
+130 interrupted.
 Documentation: docs/index.md. Each command's own --help says more.
 """
 
 FLY_HELP = """\
 Fly scenarios: for each, a vehicle process and a ground process are started, connected over UDP on loopback, and run in
-lock-step faster than real time. Without a scenario the paper's four experiments are flown: hover and spiral, each in calm
-air and in Dryden wind.
+lock-step faster than real time. Without a scenario the paper's four experiments are flown: hover and spiral, each in
+calm air and in Dryden wind.
 
 The run folder gets, for each flight, vehicle.ulg and ground.ulg (PX4's log format), link.tlog (every datagram), and for
 all together run.json and report.html, one self-contained page.
@@ -140,6 +142,31 @@ def _command(commands: Any, name: str, summary: str, description: str, epilog: s
     return parser
 
 
+def _whole(least: int, most: int) -> Callable[[str], int]:
+    """The type of an option that takes a whole number within bounds."""
+
+    def read(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and least <= int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: a whole number from {least} to {most}")
+        return int(text)
+
+    return read
+
+
+def _above_zero(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: a finite number above 0")
+    return value
+
+
+_PORT = _whole(0, 65535)
+_SYSTEM = _whole(1, 255)
+
+
 def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("scenario")
     group.add_argument("--seed", type=int, metavar="N", help="seed of wind and noise (scenario key: seed)")
@@ -185,27 +212,31 @@ def _add_vehicle(commands: Any) -> None:
     group = parser.add_argument_group("link")
     group.add_argument(
         "--instance",
-        type=int,
+        type=_whole(0, 254),
         default=0,
         metavar="I",
         help="adds I to the ports and to the system id, as PX4's instances",
     )
-    group.add_argument("--system", type=int, metavar="ID", help="MAVLink system id, 1 to 255 (default: instance + 1)")
+    group.add_argument(
+        "--system", type=_SYSTEM, metavar="ID", help="MAVLink system id, 1 to 255 (default: instance + 1)"
+    )
     group.add_argument(
         "--bind", default="127.0.0.1", metavar="HOST", help="local address of both links (default: 127.0.0.1)"
     )
     group.add_argument(
-        "--offboard-port", type=int, metavar="N", help="local port of the off-board link (default: 14580 + I)"
+        "--offboard-port", type=_PORT, metavar="N", help="local port of the off-board link (default: 14580 + I)"
     )
     group.add_argument(
         "--offboard-remote", metavar="HOST:PORT", help="where it sends first (default: 127.0.0.1:14540 + I)"
     )
     group.add_argument(
-        "--gcs-port", type=int, metavar="N", help="local port of the ground-station link (default: 18570 + I)"
+        "--gcs-port", type=_PORT, metavar="N", help="local port of the ground-station link (default: 18570 + I)"
     )
     group.add_argument("--gcs-remote", metavar="HOST:PORT", help="where it sends first (default: 127.0.0.1:14550)")
     _add_end_options(parser)
-    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="simulated over wall time (default: 1)")
+    parser.add_argument(
+        "--speed", type=_above_zero, default=1.0, metavar="X", help="simulated over wall time (default: 1)"
+    )
     parser.add_argument("--until-disarmed", action="store_true", help="end after the first flight")
     parser.set_defaults(run=_vehicle)
 
@@ -228,7 +259,10 @@ def _add_ground(commands: Any) -> None:
         help="udpin:HOST:PORT or udpout:HOST:PORT (default: udpin:127.0.0.1:14540)",
     )
     group.add_argument(
-        "--system", type=int, metavar="ID", help="fly only the vehicle with this system id (default: the first heard)"
+        "--system",
+        type=_SYSTEM,
+        metavar="ID",
+        help="fly only the vehicle with this system id (default: the first heard)",
     )
     group.add_argument(
         "--vehicle",
@@ -247,14 +281,14 @@ def _add_end_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--deadline",
-        type=float,
+        type=_above_zero,
         default=10.0,
         metavar="S",
         help="lock-step: a partner silent for so long is an error (default: 10)",
     )
     group.add_argument(
         "--cpu",
-        type=int,
+        type=_whole(0, (os.cpu_count() or 1) - 1),
         metavar="N",
         help="lock-step: run on this CPU from the first exchange on; the same for both is fastest",
     )
@@ -281,15 +315,16 @@ def _add_scenarios(commands: Any) -> None:
     parser.set_defaults(run=_scenarios)
 
 
-# --- commands ----------------------------------------------------------------------------------------------------------
+# --- commands --------------------------------------------------------------------------------------------------------
 
 
 def _settings(options: argparse.Namespace) -> list[str]:
     """All scenario options as KEY=VALUE, the form in which they are handed on to the processes."""
     settings = list(options.settings)
     named = {
-        "seed": options.seed, "airframe": options.airframe, "controller.law": options.law, "controller.level": options.level,
-        "controller.wind_information": options.wind_information, "duration_s": options.duration,
+        "seed": options.seed, "airframe": options.airframe, "duration_s": options.duration,
+        "controller.law": options.law, "controller.level": options.level,
+        "controller.wind_information": options.wind_information,
     }  # fmt: skip
     for key, value in named.items():
         if value is not None:
@@ -470,11 +505,13 @@ class _Status:
         if self._as_json:
             self._print({
                 "event": "end", "simulated_s": outcome.simulated_s, "wall_s": outcome.wall_s, "speed": outcome.speed,
-                "wire_hash": outcome.wire_hash, "finished": outcome.finished, "frames": outcome.frames, "rejected": outcome.rejected,
+                "wire_hash": outcome.wire_hash, "finished": outcome.finished,
+                "frames": outcome.frames, "rejected": outcome.rejected,
             })  # fmt: skip
             return
         print(
-            f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time; {outcome.frames} frames in"
+            f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time; "
+            f"{outcome.frames} frames in"
         )
         if outcome.rejected:
             print(f"{outcome.rejected} bad frames were dropped")
@@ -495,10 +532,6 @@ def _vehicle(options: argparse.Namespace) -> int:
     flight = _load(options.scenario, _settings(options))
     instance = options.instance
     system_id = options.system if options.system is not None else instance + 1
-    if not 1 <= system_id <= 255:
-        from mavsitl.scenario import ScenarioError
-
-        raise ScenarioError(f"--system {system_id}: allowed: 1 to 255")
     offboard_remote = options.offboard_remote or f"127.0.0.1:{ends.OFFBOARD_REMOTE_PORT + instance}"
     links = ends.VehicleLinks(
         bind=options.bind,
@@ -522,7 +555,8 @@ def _vehicle(options: argparse.Namespace) -> int:
     else:
         status.say(
             f"vehicle {system_id} ({flight.name}): off-board {links.bind}:{links.offboard_port} -> {offboard_remote}, "
-            f"ground station {links.bind}:{links.gcs_port} -> {links.gcs_remote[0]}:{links.gcs_remote[1]}; Ctrl-C ends it"
+            f"ground station {links.bind}:{links.gcs_port} -> {links.gcs_remote[0]}:{links.gcs_remote[1]}; "
+            "Ctrl-C ends it"
         )
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed,
@@ -543,7 +577,8 @@ def _ground(options: argparse.Namespace) -> int:
         remote = _endpoint(options.vehicle, "--vehicle")
         outcome = ends.ground_lockstep(
             flight, (address.host, address.port), remote, options.run_dir,
-            wing=options.wing, deadline_s=options.deadline, cpu=options.cpu, report=status.say, progress=status.progress,
+            wing=options.wing, deadline_s=options.deadline, cpu=options.cpu,
+            report=status.say, progress=status.progress,
         )  # fmt: skip
     else:
         status.say(f"ground ({flight.name}): waiting for a vehicle on {address}; Ctrl-C ends it")

@@ -1,7 +1,8 @@
 """Numba behind one decorator, so that each compiled text is also plain Python.
 
-``@compiled`` is ``numba.njit(cache=True)`` without fast-math: a compiled function gives, bit for bit, what its text gives
-un-jitted. Set ``MAVSITL_JIT=0`` to run the text itself (slow; for debuggers and for the test that holds the two together).
+``@compiled`` is ``numba.njit(cache=True)`` without fast-math: a compiled function gives, bit for bit, what its text
+gives un-jitted. Set ``MAVSITL_JIT=0`` to run the text itself (slow; for debuggers and for the test that holds the two
+together).
 
 Numba's cache does not notice a change in a function that a cached function calls. The cache therefore lives in a folder
 named by a digest of every source file of the packages that compile: a changed text never meets a stale cache.
@@ -43,7 +44,7 @@ def _set_up_cache() -> None:
 
 
 def compiled(function: F) -> F:
-    """Compile `function` with numba on its first call, cached on disk; the same text un-jitted under ``MAVSITL_JIT=0``."""
+    """Compile `function` with numba on its first call, cached on disk; the text un-jitted under ``MAVSITL_JIT=0``."""
     if not JIT:
         return function
     import numba

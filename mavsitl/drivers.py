@@ -1,7 +1,7 @@
 """Drivers: they move datagrams and time, and decide nothing. In memory, lock-step over UDP, real time over UDP.
 
-In lock-step all frames of one tick travel in one datagram each way, in memory and over UDP alike, so both put the same bytes
-on the wire. The vehicle advances when a setpoint echoes the stamp of its telemetry; a peer that stays silent is named.
+In lock-step all frames of one tick travel in one datagram each way, in memory and over UDP alike, so both put the same
+bytes on the wire. The vehicle advances when a setpoint echoes the stamp of its telemetry; a peer that stays silent is named.
 """
 
 from __future__ import annotations
@@ -64,10 +64,14 @@ class Tap:
     wire: WireHash = field(default_factory=WireHash)
     tlog: TlogWriter | None = None
     flush: Callable[[int], None] | None = None
+    started_us: int | None = None
+    """Wall clock at the first datagram of the ground: what came before is start-up, not flying."""
     _flushed_us: int = 0
 
     def hear(self, direction: Direction, now_us: int, datagram: bytes) -> None:
         self.wire.update(direction, datagram)
+        if self.started_us is None and direction is Direction.FROM_GROUND:
+            self.started_us = monotonic_us()
         if self.tlog is not None:
             self.tlog.write(now_us, datagram)
 
@@ -89,10 +93,13 @@ class _Throttle:
         self._last_us = -PROGRESS_INTERVAL_US
 
     def __call__(self, core: Core) -> None:
-        if self._progress is None:
-            return
         self._calls += 1
-        if self._calls & 63:
+        if not self._calls & 63:
+            self.now(core)
+
+    def now(self, core: Core) -> None:
+        """Also while nothing comes: the callback may want to stop the run by an exception."""
+        if self._progress is None:
             return
         now_us = monotonic_us()
         if now_us - self._last_us >= PROGRESS_INTERVAL_US:
@@ -101,9 +108,9 @@ class _Throttle:
 
 
 class _Pin:
-    """Moves the process to one CPU at the first exchange: two that take turns never run at once and are faster on one core.
+    """Moves the process to one CPU at the first exchange.
 
-    Not before: until then each starts up, which two cores do faster. Does nothing where the system has no such call.
+    Two that take turns never run at once and are faster on one core. Not before: until then each starts up, which two cores do faster. Does nothing where the system has no such call.
     """
 
     def __init__(self, cpu: int | None) -> None:
@@ -157,6 +164,10 @@ def fly_in_memory(
         now_us += period_us
 
 
+def _stopped(now_us: int, limit_s: float, silence: LinkSilent) -> LinkSilent:
+    return LinkSilent(f"lock-step stopped at t = {now_us / 1e6:g} s after {limit_s:g} s of silence: {silence}")
+
+
 def run_lockstep_vehicle(
     vehicle: VehicleCore,
     link: ConnectedUdp,
@@ -183,14 +194,16 @@ def run_lockstep_vehicle(
             link.send(datagram)
         if vehicle.finished:
             return now_us
-        patience = round((deadline_s if vehicle.token_us >= 0 else start_deadline_s) * repeat)
+        limit_s = deadline_s if vehicle.token_us >= 0 else start_deadline_s
+        patience = round(limit_s * repeat)
         while vehicle.token_us < now_us:
             try:
                 answer = link.receive()
             except LinkSilent as silence:
+                throttle.now(vehicle)
                 patience -= 1
                 if patience <= 0:
-                    raise LinkSilent(f"lock-step stopped at t = {now_us / 1e6:g} s: {silence}") from silence
+                    raise _stopped(now_us, limit_s, silence) from silence
                 if vehicle.token_us < 0:
                     for datagram in outbound:
                         link.send(datagram)
@@ -209,27 +222,32 @@ def run_lockstep_ground(
     tap: Tap,
     *,
     deadline_s: float = 10.0,
+    start_deadline_s: float = 60.0,
     cpu: int | None = None,
     progress: Progress | None = None,
 ) -> int:
     """The ground's end: it answers each datagram of the vehicle, until it has finished; the vehicle's last stamp.
 
-    Raises `LinkSilent` naming the peer when it is silent for `deadline_s`; `link` has a time-out of `FIRST_REPEAT_S`.
+    Raises `LinkSilent` naming the peer when it is silent for `deadline_s` (`start_deadline_s` before its first
+    datagram); `link` has a time-out of `FIRST_REPEAT_S`.
     """
     throttle = _Throttle(progress)
     now_us = 0
     pin = _Pin(cpu)
     last = b""
-    patience = limit = round(deadline_s / FIRST_REPEAT_S)
+    limit_s = start_deadline_s
+    patience = round(limit_s / FIRST_REPEAT_S)
     while not ground.finished:
         try:
             datagram = link.receive()
         except LinkSilent as silence:
+            throttle.now(ground)
             patience -= 1
             if patience <= 0:
-                raise LinkSilent(f"lock-step stopped at t = {now_us / 1e6:g} s: {silence}") from silence
+                raise _stopped(now_us, limit_s, silence) from silence
             continue
-        patience = limit
+        limit_s = deadline_s
+        patience = round(limit_s / FIRST_REPEAT_S)
         if datagram == last:  # the vehicle repeats its first until it is answered
             continue
         last = datagram
@@ -266,7 +284,7 @@ def run_realtime_vehicle(
     stop: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
 ) -> RealTime:
-    """The vehicle on the wall clock, times `speed`, with `links` in the order of its ports; peers join by a valid frame."""
+    """The vehicle on the wall clock, times `speed`. `links` are in the order of its ports; peers join by a valid frame."""
     clock = PacedClock(vehicle.period_us, speed)
     clock.start()
     throttle = _Throttle(progress)

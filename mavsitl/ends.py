@@ -1,4 +1,4 @@
-"""One end of a flight as a process runs it: its core, its link, its log files and its driver, put together and closed again."""
+"""One end of a flight as a process runs it: core, link, log files and driver, put together and closed again."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mavsitl import __version__, drivers, wings
 from mavsitl.clock import monotonic_us
@@ -16,7 +16,8 @@ from mavsitl.link.base import Link
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink, open_link
 from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
 from mavsitl.log.tlog import TlogWriter
-from mavsitl.log.ulog import Recorder, UlogWriter
+from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS, Topic
+from mavsitl.log.ulog import LogError, Recorder, UlogWriter
 from mavsitl.scenario import Flight
 
 WIRE_LOG = "link.tlog"
@@ -32,6 +33,7 @@ class Outcome:
 
     simulated_s: float
     wall_s: float
+    """From the first exchange on."""
     wire_hash: str
     finished: bool
     """The flight came to its end, rather than being stopped."""
@@ -49,17 +51,29 @@ class Outcome:
         return self.simulated_s / self.wall_s if self.wall_s > 0.0 else 0.0
 
 
+class _End(NamedTuple):
+    log_name: str
+    topics: tuple[Topic, ...]
+
+
+VEHICLE_END = _End(VEHICLE_LOG, VEHICLE_TOPICS)
+GROUND_END = _End(GROUND_LOG, GROUND_TOPICS)
+
+
 @contextmanager
-def _logs(folder: Path | None, log_name: str, flight: Flight, with_wire: bool) -> Iterator[tuple[Recorder, Tap]]:
+def _logs(folder: Path | None, end: _End, flight: Flight) -> Iterator[tuple[Recorder, Tap]]:
     """Recorder and tap of an end. Without a folder the rows are dropped as they come."""
     if folder is None:
         yield NullRecorder(), Tap()
         return
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogError(f"{folder}: no logs can be written there: {error.strerror or error}") from error
     info = {"sys_name": "mavsitl", "ver_sw": __version__, "scenario": flight.name}
     parameters = flight.airframe.parameters | flight.scenario.parameters
-    with UlogWriter(folder / log_name, info, parameters) as writer:
-        tlog = TlogWriter(folder / WIRE_LOG) if with_wire else None
+    with UlogWriter(folder / end.log_name, info, parameters, topics=end.topics) as writer:
+        tlog = TlogWriter(folder / WIRE_LOG) if end is VEHICLE_END else None
         try:
             yield writer, Tap(tlog=tlog, flush=writer.flush)
         finally:
@@ -73,6 +87,9 @@ class _NullRows:
     def append(self, timestamp_us: int, *values: float) -> None:
         pass
 
+    def extend(self, timestamps_us: Any, values: Any) -> None:
+        pass
+
 
 class NullRecorder:
     """Keeps nothing: for an end that runs without a folder."""
@@ -81,6 +98,9 @@ class NullRecorder:
         return _NullRows()
 
     def message(self, timestamp_us: int, level: int, text: str) -> None:
+        pass
+
+    def attach(self, drain: Callable[[], None]) -> None:
         pass
 
 
@@ -112,7 +132,7 @@ def vehicle_lockstep(
         port_option="--offboard-port N", host_option="--bind HOST",
     )  # fmt: skip
     try:
-        with _logs(folder, VEHICLE_LOG, flight, with_wire=True) as (recorder, tap):
+        with _logs(folder, VEHICLE_END, flight) as (recorder, tap):
             build = wings.find(wings.VEHICLE_GROUP, wing)
             core = build(
                 flight, recorder, seed=flight.scenario.seed, system_id=system_id, ports=("offboard",), lockstep=True
@@ -137,7 +157,7 @@ def ground_lockstep(
         host_option="--link udpin:HOST:PORT",
     )
     try:
-        with _logs(folder, GROUND_LOG, flight, with_wire=False) as (recorder, tap):
+        with _logs(folder, GROUND_END, flight) as (recorder, tap):
             core = wings.find(wings.GROUND_GROUP, wing)(flight, recorder, report=report)
             watch = _Watch(core)
             end_us = drivers.run_lockstep_ground(core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress)
@@ -148,7 +168,8 @@ def ground_lockstep(
 
 def vehicle_realtime(
     flight: Flight, links: VehicleLinks, folder: Path | None, *,
-    system_id: int, wing: str | None, speed: float, until_finished: bool, stop: Callable[[], bool], progress: Progress | None,
+    system_id: int, wing: str | None, speed: float, until_finished: bool,
+    stop: Callable[[], bool], progress: Progress | None,
 ) -> Outcome:  # fmt: skip
     """The vehicle on the wall clock, with PX4 SITL's two links. Raises as `vehicle_lockstep`."""
     opened: list[Link] = []
@@ -166,7 +187,7 @@ def vehicle_realtime(
                 (links.bind, links.gcs_port), links.gcs_remote, port_option="--gcs-port N", host_option="--bind HOST"
             )
         )
-        with _logs(folder, VEHICLE_LOG, flight, with_wire=True) as (recorder, tap):
+        with _logs(folder, VEHICLE_END, flight) as (recorder, tap):
             build = wings.find(wings.VEHICLE_GROUP, wing)
             core = build(
                 flight,
@@ -189,12 +210,13 @@ def vehicle_realtime(
 
 def ground_realtime(
     flight: Flight, address: Address, folder: Path | None, *,
-    vehicle_system_id: int | None, wing: str | None, report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
+    vehicle_system_id: int | None, wing: str | None,
+    report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
 ) -> Outcome:  # fmt: skip
     """The ground on the wall clock, on any endpoint. Raises as `vehicle_lockstep`."""
     link = open_link(address, port_option="--link udpin:HOST:PORT", host_option="--link udpin:HOST:PORT")
     try:
-        with _logs(folder, GROUND_LOG, flight, with_wire=False) as (recorder, tap):
+        with _logs(folder, GROUND_END, flight) as (recorder, tap):
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
@@ -209,8 +231,8 @@ def in_memory(
 ) -> Outcome:
     """Both ends in this process; the same bytes as in lock-step over UDP."""
     with (
-        _logs(folder, VEHICLE_LOG, flight, with_wire=True) as (vehicle_recorder, tap),
-        _logs(folder, GROUND_LOG, flight, with_wire=False) as (ground_recorder, ground_tap),
+        _logs(folder, VEHICLE_END, flight) as (vehicle_recorder, tap),
+        _logs(folder, GROUND_END, flight) as (ground_recorder, ground_tap),
     ):
         vehicle_flush, ground_flush = tap.flush, ground_tap.flush
 
@@ -228,7 +250,7 @@ def in_memory(
 
 
 class _Watch:
-    """Wall time of a run, from the construction of its core: set-up and compilation are not counted as flying."""
+    """Wall time of a run, from the first exchange: start-up and waiting for the other side do not count."""
 
     def __init__(self, core: Any) -> None:
         self._core = core
@@ -240,7 +262,7 @@ class _Watch:
         counters = self._core.counters
         return Outcome(
             simulated_s=simulated_us / 1e6,
-            wall_s=(monotonic_us() - self._start_us) / 1e6,
+            wall_s=(monotonic_us() - (tap.started_us or self._start_us)) / 1e6,
             wire_hash=tap.wire.hexdigest(),
             finished=self._core.finished,
             frames=counters.frames,

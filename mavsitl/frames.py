@@ -1,7 +1,7 @@
 """The one frame boundary: world NWU and body FLU inside, NED and FRD on the wire.
 
-Both changes of frame are the same half turn about the x axis, so they are sign flips, exact in floating point, and their
-own inverses:
+Both changes of frame are the same half turn about the x axis, so they are sign flips, exact in floating point, and
+their own inverses:
 
 - a vector ``(x, y, z)`` becomes ``(x, -y, -z)``, whether world (NWU <-> NED) or body (FLU <-> FRD);
 - an attitude quaternion ``(w, x, y, z)``, body to world, becomes ``(w, x, -y, -z)``;

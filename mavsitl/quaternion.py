@@ -99,3 +99,16 @@ def to_euler(unit: Quaternion) -> Vector:
         yaw = 2.0 * atan2(x, w)
         return 0.0, pitch, remainder(-yaw if sin_pitch > 0.0 else yaw, 2.0 * pi)
     return atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)), pitch, atan2(forward_y, forward_x)
+
+
+def euler_rates(angles_rad: Vector, omega_rad_s: Vector) -> Vector:
+    """Time derivatives of Z-Y-X roll, pitch, yaw from the body rates, rad/s; the pole at pitch +-90 degrees is cut off.
+
+    Where the paper writes the body rates as the angles' derivatives (eq 11), this is the exact relation.
+    """
+    roll, pitch, _ = angles_rad
+    p, q, r = omega_rad_s
+    about_z = q * sin(roll) + r * cos(roll)
+    cosine = max(cos(pitch), 1e-3)
+    yaw_rate = about_z / cosine
+    return p + yaw_rate * sin(pitch), q * cos(roll) - r * sin(roll), yaw_rate

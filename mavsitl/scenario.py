@@ -10,6 +10,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -35,7 +36,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 class Rates(Section, frozen=True):
     physics_hz: Annotated[int, msgspec.Meta(ge=50, le=20_000)] = 1000
     control_hz: Annotated[int, msgspec.Meta(ge=10, le=1000)] = 250
-    """Off-board cycle: telemetry out, setpoint in. A whole number of milliseconds, because the wire's stamp is in ms."""
+    """Off-board cycle: telemetry out, setpoint in. A whole number of milliseconds, as the wire's stamp is in ms."""
 
     @property
     def control_period_us(self) -> int:
@@ -68,7 +69,7 @@ class Steady(Section, frozen=True, tag_field="model", tag="steady"):
 
 
 class Gust(Section, frozen=True, tag_field="model", tag="gust"):
-    """The 1-cosine gust of MIL-F-8785C: 0 before `start_s`, rising over `length_s` to its amplitude, then held or gone."""
+    """The 1-cosine gust of MIL-F-8785C: 0 before `start_s`, rising over `length_s` to its peak, then held or gone."""
 
     velocity_nwu_m_s: Vector3
     start_s: NonNegative
@@ -88,7 +89,7 @@ class DrydenPaper(Section, frozen=True, tag_field="model", tag="dryden-paper"):
 
 
 class DrydenMil(Section, frozen=True, tag_field="model", tag="dryden-mil"):
-    """MIL-F-8785C / MIL-HDBK-1797 low-altitude model, turned with the mean wind; the mean itself included on request."""
+    """MIL-F-8785C / MIL-HDBK-1797 low-altitude model, turned with the mean wind; the mean included on request."""
 
     wind_speed_20ft_m_s: Positive
     altitude_m: Annotated[float, msgspec.Meta(gt=0.0, le=304.8)]
@@ -145,7 +146,7 @@ class Figure8(Section, frozen=True, tag_field="kind", tag="figure-8"):
 
 
 class Waypoints(Section, frozen=True, tag_field="kind", tag="waypoints"):
-    """Straight legs at `speed_m_s` through the rows of a CSV file: x, y, z in metres NWU, yaw in degrees, hold in seconds."""
+    """Straight legs at `speed_m_s` through the rows of a CSV file: x, y, z in m NWU, yaw in degrees, hold in s."""
 
     file: str
     speed_m_s: Positive = 1.0
@@ -186,7 +187,7 @@ class Learning(Section, frozen=True):
 class WindObserver(Section, frozen=True):
     """Bandwidths of the velocity disturbance observer that stands in for W_1..W_3."""
 
-    horizontal_rad_s: Positive = 22.0
+    horizontal_rad_s: Positive = 10.0
     vertical_rad_s: Positive = 16.5
 
 
@@ -203,10 +204,11 @@ class Controller(Section, frozen=True):
     derivative: Literal["rate", "difference"] = "rate"
     """The D neuron's input: the measured body rate, or the differenced angle error of eq 28."""
     altitude: Gains = Gains(k_p_per_s2=5.29, k_i_per_s3=0.608, k_d_per_s=6.67)
-    position: Gains = Gains(k_p_per_s2=9.92, k_i_per_s3=0.188, k_d_per_s=4.35)
-    roll_pitch: Gains = Gains(k_p_per_s2=961.0, k_i_per_s3=328.0, k_d_per_s=92.4)
-    yaw: Gains = Gains(k_p_per_s2=130.0, k_i_per_s3=148.0, k_d_per_s=22.8)
-    angle_filter_rad_s: NonNegative = 14.6
+    position: Gains = Gains(k_p_per_s2=10.89, k_i_per_s3=0.216, k_d_per_s=4.356)
+    roll_pitch: Gains = Gains(k_p_per_s2=1600.0, k_i_per_s3=640.0, k_d_per_s=104.0)
+    """For ideal rotors; with 30 ms of lag they are unstable, see the scenario hover-wind-realistic."""
+    yaw: Gains = Gains(k_p_per_s2=625.0, k_i_per_s3=781.0, k_d_per_s=80.0)
+    angle_filter_rad_s: NonNegative = 10.0
     """First-order filter on phi_d and theta_d; 0 is none."""
     tilt_limit_deg: Annotated[float, msgspec.Meta(gt=0.0, lt=90.0)] = 50.0
     learning: Learning = Learning()
@@ -250,9 +252,9 @@ def names() -> list[str]:
 
 
 def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
-    """Read a shipped scenario by name, or a file by path; `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``.
+    """Read a shipped scenario by name, or a file by path.
 
-    Raises `ScenarioError`.
+    `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``. Raises `ScenarioError`.
     """
     text, where, folder = _read("scenarios", name_or_path, names())
     data = _parse(text, where)
@@ -457,7 +459,8 @@ def _check(scenario: Scenario, where: str) -> None:
         )
     if 1000 % rates.control_hz:
         raise ScenarioError(
-            f"{where}: rates.control_hz: one cycle of {rates.control_hz} Hz is not a whole number of milliseconds; allowed: "
+            f"{where}: rates.control_hz: one cycle of {rates.control_hz} Hz is not a whole number of milliseconds; "
+            "allowed: "
             + ", ".join(str(hz) for hz in range(10, 1001) if 1000 % hz == 0)
         )
     if MICROSECONDS_PER_SECOND % rates.physics_hz:
@@ -472,5 +475,5 @@ def _check(scenario: Scenario, where: str) -> None:
     if controller.learning.guards and controller.learning.projection is None:
         raise ScenarioError(f"{where}: controller.learning.projection: may be left out only with guards = false")
     steps = scenario.reference.steps if isinstance(scenario.reference, Steps) else ()
-    if any(later.time_s <= earlier.time_s for earlier, later in zip(steps, steps[1:], strict=False)):
+    if any(later.time_s <= earlier.time_s for earlier, later in pairwise(steps)):
         raise ScenarioError(f"{where}: reference.steps: time_s must increase from step to step")

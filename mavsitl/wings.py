@@ -18,7 +18,7 @@ class WingError(LookupError):
 
 
 def find(group: Group, name: str | None = None) -> Any:
-    """The `build` function of a wing: ``build(flight, recorder, **options) -> core``. Without a name: the shipped one."""
+    """The `build` function of a wing: ``build(flight, recorder, **options) -> core``. No name: the shipped one."""
     found: dict[str, EntryPoint] = {point.name: point for point in entry_points(group=group)}
     wanted = name or _SHIPPED[group]
     if wanted not in found:

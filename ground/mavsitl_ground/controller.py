@@ -1,4 +1,7 @@
-"""The paper's controller as an off-board process: telemetry in, observer, reference, PID, PIDNN, setpoint out. Sans-IO."""
+"""The paper's controller as an off-board process: telemetry in, observer, reference, PID, PIDNN, setpoint out.
+
+Sans-IO.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,9 @@ from mavsitl.control.inner_loop import InnerLoop
 from mavsitl.control.pid import PositionLoop
 from mavsitl.control.wind_observer import WindObserver, model_acceleration
 from mavsitl.dialect import mavlink
-from mavsitl.frames import flip_euler, flip_vector
+from mavsitl.frames import flip_euler
 from mavsitl.log import topics
+from mavsitl.log.block import Block, ned
 from mavsitl.log.ulog import Recorder
 from mavsitl.node import Node
 from mavsitl.quaternion import from_euler
@@ -43,7 +47,7 @@ SYS_STATE_INTERVAL_US = 200_000
 
 
 class Controller:
-    """The paper's nested loops (fig 3) for one vehicle, from state to demand; no message, no clock but the vehicle's stamp."""
+    """The paper's nested loops (fig 3) for one vehicle, from state to demand; no message, no clock but its stamp."""
 
     def __init__(self, flight: Flight) -> None:
         """Raises `ScenarioError` where the airframe does not say what the command level needs."""
@@ -84,6 +88,8 @@ class Controller:
         self.omega_acceleration = np.zeros((3, 1))
         """What the inner loop asked for, rad/s^2 FLU (3, 1)."""
         self.reset()
+        self.update(0.0, Observer())  # compiles, or reads the cache, before the clock runs
+        self.reset()
 
     @property
     def desired_rad(self) -> Array:
@@ -104,6 +110,7 @@ class Controller:
         self._acting_thrust[0] = self._airframe.weight_n
         self.thrust_n = self._airframe.weight_n
         self._stamp_us = -1
+        self.wind_acceleration = self._no_wind
 
     def update(self, time_s: float, state: Observer) -> None:
         """One control cycle at flight time `time_s`; fills thrust_n, desired_rad and omega_acceleration."""
@@ -125,11 +132,11 @@ class Controller:
         self.thrust_n = float(thrust[0])
         if self._settings.level != "attitude":
             self.omega_acceleration = self._inner.update(
-                state.angles_rad, state.omega_flu_rad_s, self._desired, self._desired_rates
+                state.angles_rad, state.angle_rates_rad_s, self._desired, self._desired_rates
             )
 
     def _wind(self, state: Observer) -> Array:
-        """W_1..W_3 of eq 11 by the scenario's source; the rotors' lag is part of the model where the airframe has one."""
+        """W_1..W_3 of eq 11 by the scenario's source; the model includes the rotors' lag where the airframe has one."""
         self._acting_thrust += self._thrust_share * (self.thrust_n - self._acting_thrust)
         source = self._settings.wind_information
         if source == "oracle":
@@ -145,18 +152,12 @@ class Controller:
         return self._wind_observer.update(state.velocity_nwu_m_s, self._model, period_s)
 
     def rates_flu_rad_s(self, state: Observer) -> Array:
-        """Level `body_rate`: the rate setpoint that makes a proportional rate loop give the wanted angular acceleration."""
+        """Level `body_rate`: the rates that make a proportional rate loop give the wanted angular acceleration."""
         return state.omega_flu_rad_s + self.omega_acceleration / self._rate_gain
 
     def torque_shares(self) -> list[float]:
         shares: list[float] = self._inner.torque_shares(self.omega_acceleration)[:, 0].tolist()
         return shares
-
-    def u(self) -> tuple[float, float, float, float]:
-        """U_1..U_4 of eq 12: N, N, N, N m."""
-        x, y, z = self._inner.torque_n_m(self.omega_acceleration)[:, 0].tolist()
-        arm = self._airframe.arm_m
-        return self.thrust_n, x / arm, y / arm, z
 
 
 def _rate_gain(flight: Flight) -> Array:
@@ -206,11 +207,7 @@ class Ground:
         self._max_thrust_n = flight.airframe.max_thrust_n
         self._released_us: int | None = None
         self._heartbeat_us = -HEARTBEAT_INTERVAL_US
-        self._trajectory = recorder.topic(topics.TRAJECTORY_SETPOINT)
-        self._attitude = recorder.topic(topics.ATTITUDE_SETPOINT)
-        self._demand = recorder.topic(topics.CONTROL_DEMAND)
-        self._weights = recorder.topic(topics.PIDNN_WEIGHTS)
-        self._link = recorder.topic(topics.LINK_STATUS)
+        self._record = _Record(recorder, flight, with_weights=self._controller.weights is not None)
         self._now_us = 0
 
     @property
@@ -258,9 +255,9 @@ class Ground:
         """At least every control period, and after each datagram: control on new state, handshake, heartbeat."""
         self._now_us = now_us
         handshake, state = self._handshake, self._observer
+        before = handshake.phase
         if state.restarted:
             handshake.lose("its clock went back, it has restarted", now_us)
-        before = handshake.phase
         handshake.step(now_us)
         if handshake.phase is Phase.SEARCH and before is not Phase.SEARCH:
             self._observer.reset()
@@ -307,7 +304,9 @@ class Ground:
             demand.send_rates(self._node, target, state.stamp_us, (p, q, r), thrust)
         else:
             demand.send_torque(self._node, target, state.stamp_us, controller.torque_shares(), thrust)
-        self._write_log(thrust)
+        source = self._node.sources.get(target)
+        lost = 0 if source is None else source.lost
+        self._record.write(now_us, state, controller, thrust, self._node.counters, lost)
         if handshake.phase is Phase.FLY and time_s >= self._scenario.duration_s:
             handshake.finish(now_us)
 
@@ -322,26 +321,64 @@ class Ground:
         else:
             demand.send_torque(self._node, target, stamp_us, (0.0, 0.0, 0.0), thrust)
 
-    def _write_log(self, thrust: float) -> None:
-        state, controller = self._observer, self._controller
-        stamp_us = state.stamp_us
-        (x, y, z), (vx, vy, vz), _, yaw = controller.reference
-        self._trajectory.append(stamp_us, *flip_vector(x, y, z), *flip_vector(vx, vy, vz), -yaw)
-        phi, theta, psi = controller.desired_rad[:, 0].tolist()
-        self._attitude.append(stamp_us, *flip_euler(phi, theta, psi), 0.0, 0.0, -thrust)
-        self._demand.append(stamp_us, *controller.u(), *controller.wind_acceleration[:, 0].tolist())
-        weights = controller.weights
-        if weights is not None:
-            self._weights.append(stamp_us, *weights[:, :, 0].T.ravel().tolist())
-        counters = self._node.counters
-        age_us = state.age_us(self._now_us) or 0
-        source = self._node.sources.get(self._handshake.target or (0, 0))
-        lost = 0 if source is None else source.lost
-        self._link.append(stamp_us, counters.frames, lost, counters.rejected, age_us)
-
     def _send_command(self, command: int, confirmation: int, params: tuple[float, ...]) -> None:
         system_id, component_id = self._handshake.target or (0, 0)
         self._node.send(COMMAND_LONG, system_id, component_id, command, confirmation, *params)
+
+
+# Columns of the ground's log block.
+_REFERENCE = slice(0, 7)  # position, velocity, yaw
+_DESIRED = slice(7, 10)
+_THRUST = 10
+_U1 = 11
+_ACCELERATION = slice(12, 15)
+_WIND = slice(15, 18)
+_LINK = slice(18, 22)
+_WEIGHTS = slice(22, 31)  # roll P I D, pitch P I D, yaw P I D
+_WIDTH = 31
+
+
+class _Record:
+    """The ground's log, on the vehicle's clock: what was wanted, commanded and learned in each cycle."""
+
+    def __init__(self, recorder: Recorder, flight: Flight, with_weights: bool) -> None:
+        airframe = flight.airframe
+        # Angular acceleration to U_2, U_3 (forces) and U_4 (torque).
+        per_u = np.array(airframe.inertia_kg_m2) / (airframe.arm_m, airframe.arm_m, 1.0)
+        self._with_weights = with_weights
+        columns = [
+            (topics.TRAJECTORY_SETPOINT, lambda v: np.hstack((ned(v[:, 0:3]), ned(v[:, 3:6]), -v[:, 6:7]))),
+            (topics.ATTITUDE_SETPOINT, _attitude_setpoint),
+            (
+                topics.CONTROL_DEMAND,
+                lambda v: np.hstack((v[:, _U1, np.newaxis], v[:, _ACCELERATION] * per_u, v[:, _WIND])),
+            ),
+            (topics.LINK_STATUS, lambda v: v[:, _LINK]),
+        ]
+        if with_weights:
+            columns.append((topics.PIDNN_WEIGHTS, lambda v: v[:, _WEIGHTS]))
+        self._block = Block(recorder, _WIDTH, columns)
+
+    def write(
+        self, now_us: int, state: Observer, controller: Controller, thrust: float, counters: Any, lost: int
+    ) -> None:
+        row = self._block.row(state.stamp_us)
+        position, velocity, _, yaw = controller.reference
+        row[_REFERENCE] = (*position, *velocity, yaw)
+        row[_DESIRED] = controller.desired_rad[:, 0]
+        row[_THRUST] = thrust
+        row[_U1] = controller.thrust_n
+        row[_ACCELERATION] = controller.omega_acceleration[:, 0]
+        row[_WIND] = controller.wind_acceleration[:, 0]
+        row[_LINK] = (counters.frames, lost, counters.rejected, state.age_us(now_us) or 0)
+        if self._with_weights and controller.weights is not None:
+            row[_WEIGHTS] = controller.weights[:, :, 0].T.ravel()
+
+
+def _attitude_setpoint(values: Array) -> Array:
+    """phi_d, theta_d, psi_d in FRD and PX4's thrust_body, (k, 6)."""
+    zero = np.zeros(len(values))
+    return np.column_stack((*flip_euler(*values[:, _DESIRED].T), zero, zero, -values[:, _THRUST]))
 
 
 def build(flight: Flight, recorder: Recorder, **options: Any) -> Ground:

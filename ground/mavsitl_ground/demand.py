@@ -1,4 +1,7 @@
-"""Demands to setpoint messages: the ground's frame boundary out. The stamp of the state it answers is each message's token."""
+"""Demands to setpoint messages: the ground's frame boundary out.
+
+The stamp of the state it answers is each message's token.
+"""
 
 from __future__ import annotations
 

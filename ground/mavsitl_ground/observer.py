@@ -1,4 +1,7 @@
-"""Telemetry to state: the vehicle as the controller knows it, with its age and validity. The ground's frame boundary in."""
+"""Telemetry to state: the vehicle as the controller knows it, with its age and validity.
+
+The ground's frame boundary in.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import numpy as np
 
 from mavsitl.dialect import mavlink
 from mavsitl.frames import flip_quaternion, flip_vector
-from mavsitl.quaternion import normalise, rotate, to_euler
+from mavsitl.quaternion import euler_rates, normalise, rotate, to_euler
 
 Frames = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
 
@@ -27,6 +30,8 @@ class Observer:
         self.quaternion = np.array([[1.0], [0.0], [0.0], [0.0]])
         self.angles_rad = np.zeros((3, 1))
         self.omega_flu_rad_s = np.zeros((3, 1))
+        self.angle_rates_rad_s = np.zeros((3, 1))
+        """Time derivatives of `angles_rad`, from the body rates."""
         self.true_wind_nwu_m_s: np.ndarray[Any, np.dtype[np.float64]] | None = None
         """From DEBUG_VECT "WIND_TRUE": the oracle's. None until one came."""
         self.reset()
@@ -58,7 +63,7 @@ class Observer:
         return age is not None and age <= self._max_age_us
 
     def receive(self, message: Any, now_us: int) -> None:
-        """A message of the vehicle; others than the four below are ignored, and so is one with a value that is not finite."""
+        """A message of the vehicle; others than the four below are ignored, as is one with a value that is not finite."""
         kind = type(message).id
         if kind == mavlink.MAVLINK_MSG_ID_ODOMETRY:
             self._on_odometry(message, now_us)
@@ -77,15 +82,18 @@ class Observer:
         if message.frame_id != mavlink.MAV_FRAME_LOCAL_NED or message.child_frame_id not in Frames:
             return
         q = tuple(message.q)
-        velocity = (message.vx, message.vy, message.vz)
+        rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
+        position, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
+        # One message is one state: half of a bad one is not taken.
+        if not (_is_attitude(q, rates) and isfinite(sum(position) + sum(velocity))):
+            return
         if message.child_frame_id == mavlink.MAV_FRAME_BODY_FRD:
             velocity = rotate(normalise(q), velocity)
-        self._attitude(q, (message.rollspeed, message.pitchspeed, message.yawspeed), message.time_usec, now_us)
-        self._position((message.x, message.y, message.z), velocity, message.time_usec)
+        self._attitude(q, rates, message.time_usec, now_us)
+        self._position(position, velocity, message.time_usec)
 
     def _attitude(self, q: Any, rates: Any, stamp_us: int, now_us: int) -> None:
-        w, x, y, z = q
-        if not (abs(w * w + x * x + y * y + z * z - 1.0) <= 0.05 and isfinite(sum(rates))):
+        if not _is_attitude(q, rates):
             return
         if stamp_us < self.stamp_us:
             if self.stamp_us - stamp_us > 1_000_000:
@@ -93,8 +101,11 @@ class Observer:
             return
         unit = normalise(flip_quaternion(*q))
         self.quaternion[:, 0] = unit
-        self.angles_rad[:, 0] = to_euler(unit)
-        self.omega_flu_rad_s[:, 0] = flip_vector(*rates)
+        angles = to_euler(unit)
+        self.angles_rad[:, 0] = angles
+        omega = flip_vector(*rates)
+        self.omega_flu_rad_s[:, 0] = omega
+        self.angle_rates_rad_s[:, 0] = euler_rates(angles, omega)
         self._fresh = self._fresh or stamp_us > self.stamp_us
         self.stamp_us = stamp_us
         self._received_us = now_us
@@ -105,3 +116,9 @@ class Observer:
         self.position_nwu_m[:, 0] = flip_vector(*position)
         self.velocity_nwu_m_s[:, 0] = flip_vector(*velocity)
         self._position_us = stamp_us
+
+
+def _is_attitude(q: Any, rates: Any) -> bool:
+    """Near unit length and finite."""
+    w, x, y, z = q
+    return abs(w * w + x * x + y * y + z * z - 1.0) <= 0.05 and isfinite(sum(rates))

@@ -1,7 +1,7 @@
 """The handshake that brings a vehicle into OFFBOARD and back: one table of phases, stepped with the time.
 
-SEARCH -> CONNECT -> STREAM -> OFFBOARD -> ARM -> RELEASE -> FLY -> STOP -> DONE; a silent or restarted vehicle leads back to
-SEARCH from anywhere, a vehicle that somebody else disarmed in flight to ABORTED.
+SEARCH -> CONNECT -> STREAM -> OFFBOARD -> ARM -> RELEASE -> FLY -> STOP -> DONE; a silent or restarted vehicle leads back
+to SEARCH from anywhere, a vehicle that somebody else disarmed in flight to ABORTED.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ ENDED = (Phase.DONE, Phase.ABORTED)
 
 
 class Handshake:
-    """What to ask of the vehicle next. `receive` its HEARTBEAT, EXTENDED_SYS_STATE and COMMAND_ACK; `step` with the time."""
+    """What to ask of the vehicle next.
+
+    `receive` takes its HEARTBEAT, EXTENDED_SYS_STATE and COMMAND_ACK; `step` the time.
+    """
 
     def __init__(
         self,
@@ -72,7 +75,7 @@ class Handshake:
 
     @property
     def in_control(self) -> bool:
-        """Flying, and the vehicle follows: a fail-safe or a pilot's mode change takes this away without ending the flight."""
+        """Flying, and the vehicle follows: a fail-safe or a pilot's mode change ends this, but not the flight."""
         return self.phase is Phase.FLY and self.offboard and self.armed
 
     def accepts(self, system_id: int, component_id: int) -> bool:

@@ -54,7 +54,7 @@ class Airframe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def max_torque_n_m(self) -> tuple[float, float, float]:
-        """Torque 1.0 on the wire, roll, pitch, yaw: the most that eq 12 gives with every rotor between 0 and full speed."""
+        """Torque 1.0 on the wire, roll, pitch, yaw: the most that eq 12 gives with rotors between 0 and full speed."""
         roll = self.arm_m * self.max_thrust_n / 4.0
         yaw = 2.0 * self.drag_coefficient_n_m_s2 * self.max_rotor_speed_rad_s**2
         return roll, roll, yaw

@@ -11,7 +11,7 @@ from mavsitl.scenario import Controller
 
 
 class InnerLoop:
-    """Angles to angular acceleration (eqs 27-57), and from there to what the wire carries: torque shares or body rates."""
+    """Angles to angular acceleration (eqs 27-57), and from there to the wire's torque shares or body rates."""
 
     def __init__(self, controller: Controller, airframe: Airframe, period_s: float, n: int = 1) -> None:
         inertia, torque = airframe.inertia_kg_m2, airframe.max_torque_n_m

@@ -68,6 +68,22 @@ class Topic:
             fields.append((name, code) if count is None else (name, code, (count,)))
         return np.dtype(fields)
 
+    def pack(self, message_id: int, timestamps_us: npt.NDArray[np.uint64], values: npt.NDArray[np.float64]) -> bytes:
+        """k ULog data messages: `timestamps_us` (k,), `values` (k, fields flat). Beyond float32's range is infinite."""
+        rows = np.empty(len(timestamps_us), self.dtype)
+        rows["ulog_header"] = np.void(struct.pack("<HBH", self.dtype.itemsize - 3, DATA_MESSAGE, message_id))
+        rows["timestamp"] = timestamps_us
+        at = 0
+        with np.errstate(over="ignore"):
+            for name, _, count in self.columns[1:]:
+                width = count or 1
+                part = values[:, at : at + width]
+                rows[name] = part if count is not None else part[:, 0]
+                at += width
+        if at != values.shape[1]:
+            raise ValueError(f"{self.name}: {values.shape[1]} values a row, it has {at}")
+        return rows.tobytes()
+
     def arrays(self, buffer: bytes | bytearray | memoryview, count: int) -> dict[str, npt.NDArray[Any]]:
         """The first `count` rows of `buffer`, copied: scalars (count,), arrays (count, length)."""
         rows = np.frombuffer(buffer, self.dtype, count)

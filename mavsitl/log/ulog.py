@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
@@ -78,6 +78,15 @@ class Rows:
             self._pack_into(sink.buffer, offset, self._body, DATA_MESSAGE, self._id, timestamp_us, *limited)
         sink.offset = offset + size
 
+    def extend(self, timestamps_us: npt.NDArray[np.uint64], values: npt.NDArray[np.float64]) -> None:
+        """k rows: `timestamps_us` (k,), `values` (k, the topic's fields flat). As k times `append`."""
+        rows = self.topic.pack(self._id, timestamps_us, values)
+        sink = self._sink
+        if sink.offset + len(rows) > sink.capacity:
+            sink.make_room(len(rows))
+        sink.buffer[sink.offset : sink.offset + len(rows)] = rows
+        sink.offset += len(rows)
+
 
 class Recorder(Protocol):
     """What a wing logs to."""
@@ -88,12 +97,16 @@ class Recorder(Protocol):
     def message(self, timestamp_us: int, level: int, text: str) -> None:
         """A line of text; `level` is MAV_SEVERITY, 0 (emergency) to 7 (debug)."""
 
+    def attach(self, drain: Callable[[], None]) -> None:
+        """`drain` is called before the rows are read, flushed or closed: for those who gather rows first."""
+
 
 class MemoryRecorder:
     """Keeps everything in memory."""
 
     def __init__(self) -> None:
         self._rows: dict[str, tuple[Rows, _Sink]] = {}
+        self._drains: list[Callable[[], None]] = []
         self.messages: list[tuple[int, int, str]] = []
         """(timestamp us, level, text)"""
 
@@ -109,8 +122,13 @@ class MemoryRecorder:
     def message(self, timestamp_us: int, level: int, text: str) -> None:
         self.messages.append((timestamp_us, level, text))
 
+    def attach(self, drain: Callable[[], None]) -> None:
+        self._drains.append(drain)
+
     def arrays(self, topic: Topic) -> dict[str, npt.NDArray[Any]]:
         """A copy of the columns, scalars (k,), arrays (k, length), in the log's own types; k = 0 if never written."""
+        for drain in self._drains:
+            drain()
         rows, sink = self._rows.get(topic.name, (None, _Sink(0)))
         if rows is not None and rows.topic != topic:
             raise ValueError(f"{topic.name}: recorded with other fields")
@@ -118,6 +136,8 @@ class MemoryRecorder:
 
     def tables(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
         """Every topic that has rows, as `read` gives it."""
+        for drain in self._drains:
+            drain()
         return {name: self.arrays(rows.topic) for name, (rows, sink) in self._rows.items() if sink.offset}
 
 
@@ -192,6 +212,7 @@ class UlogWriter:
         self.path = path
         asked = tuple(topics)
         self._flushed_us = start_us
+        self._drains: list[Callable[[], None]] = []
         parts = [MAGIC + struct.pack("<Q", start_us), _message("B", bytes(40))]
         parts += [_message("F", topic.ulog_format.encode("ascii")) for topic in asked]
         for key, text in info.items():
@@ -225,10 +246,18 @@ class UlogWriter:
         """Hand the rows to the system once per simulated second, so that a killed process leaves a readable file."""
         if now_us - self._flushed_us >= FLUSH_PERIOD_US:
             self._flushed_us = now_us
+            for drain in self._drains:
+                drain()
             self._sink.drain()
+
+    def attach(self, drain: Callable[[], None]) -> None:
+        self._drains.append(drain)
 
     def close(self) -> None:
         """Write what is left. More than once is harmless."""
+        drains, self._drains = self._drains, []
+        for drain in drains:
+            drain()
         self._sink.close()
 
     def __enter__(self) -> UlogWriter:

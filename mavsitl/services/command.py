@@ -1,4 +1,4 @@
-"""The command protocol: COMMAND_LONG and COMMAND_INT in, one final COMMAND_ACK out; and the side that asks, with retries."""
+"""The command protocol: COMMAND_LONG and COMMAND_INT in, one final COMMAND_ACK out; and the asking side, with retries."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from mavsitl.dialect import mavlink
 
 
 class Command(NamedTuple):
-    """A command, whichever message brought it. Parameters are as sent: NaN means 'default'; 5 and 6 of COMMAND_INT stay integers."""
+    """A command, whichever message brought it.
+
+    Parameters are as sent: NaN means 'default'; 5 and 6 of COMMAND_INT stay integers.
+    """
 
     id: int
     params: tuple[float, float, float, float, float, float, float]
@@ -28,14 +31,21 @@ class Command(NamedTuple):
 
 
 class CommandServer:
-    """Answers each command once: a repeat (`confirmation` > 0) gets the first answer again and is not executed twice."""
+    """Answers each command once: a repeat (`confirmation` > 0) gets the first answer again and is not executed twice.
+
+    An answer is forgotten `MEMORY_US` after it was last asked for. A repeat that comes later is of a new command, whose
+    first frame was lost.
+    """
 
     REMEMBERED = 32
+    MEMORY_US = 3_000_000
+    """Clients repeat after 0.5 s (MAVSDK) to 1.2 s (QGroundControl)."""
 
     def __init__(self, execute: Callable[[Command, int], int]) -> None:
         """`execute(command, now_us)` does it and returns the MAV_RESULT."""
         self._execute = execute
-        self._answers: OrderedDict[tuple[int, int, int, str], int] = OrderedDict()
+        self._answers: OrderedDict[tuple[int, int, int, str], tuple[int, int]] = OrderedDict()
+        """(MAV_RESULT, time us of the last frame)"""
 
     def receive(self, message: Any, system_id: int, component_id: int, now_us: int) -> tuple[int, int]:
         """A COMMAND_LONG or COMMAND_INT that is addressed to us: its id and the MAV_RESULT to acknowledge."""
@@ -46,10 +56,12 @@ class CommandServer:
         params = (message.param1, message.param2, message.param3, message.param4, *last)
         command = Command(message.command, params, frame, system_id, component_id)
         key = (command.id, system_id, component_id, repr(params))
-        if confirmation > 0 and key in self._answers:
-            return command.id, self._answers[key]
-        result = self._execute(command, now_us)
-        self._answers[key] = result
+        known = self._answers.get(key)
+        if confirmation > 0 and known is not None and now_us - known[1] < self.MEMORY_US:
+            result = known[0]
+        else:
+            result = self._execute(command, now_us)
+        self._answers[key] = (result, now_us)
         self._answers.move_to_end(key)
         if len(self._answers) > self.REMEMBERED:
             self._answers.popitem(last=False)

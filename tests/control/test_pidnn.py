@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from mavsitl.control.arrays import Floats
 from mavsitl.control.pidnn import AttitudePid, Derivative, Pidnn, initial_weights
-from mavsitl.scenario import Controller, Gains, Learning, Vector3
+from mavsitl.scenario import Gains, Learning, Vector3
 from tests.control.linear_loop import held_plant
 
 T_S = 0.004
-ROLL_PITCH = Controller().roll_pitch
-YAW = Controller().yaw
+ROLL_PITCH = Gains(k_p_per_s2=961.0, k_i_per_s3=328.0, k_d_per_s=92.4)
+YAW = Gains(k_p_per_s2=130.0, k_i_per_s3=148.0, k_d_per_s=22.8)
 START = initial_weights(ROLL_PITCH, YAW, T_S)
 PLAIN = Learning(guards=False, bound="none")
 UNLIMITED: Vector3 = (float("inf"), float("inf"), float("inf"))

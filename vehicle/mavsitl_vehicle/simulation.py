@@ -1,4 +1,4 @@
-"""The physical side of the vehicle wing: n vehicles' plant, wind, sensors and inner loops, advanced a tick at a time."""
+"""The physical side of the vehicle wing: n vehicles' plant, wind, sensors and inner loops, tick by tick."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ SATURATED_MASK = 0xFF
 
 
 class Simulation:
-    """Arrays have the fleet axis last. `x` (17, n) is the truth, `estimate` (13, n) what the sensors say, `wind` (3, n)."""
+    """Arrays have the fleet axis last: `x` (17, n) the truth, `estimate` (13, n) what the sensors say, `wind` (3, n)."""
 
     def __init__(self, flight: Flight, parameters: Parameters, seed: int, n: int = 1) -> None:
         scenario, airframe = flight.scenario, flight.airframe
         self.n = n
         self.substeps = scenario.rates.substeps
         self.dt_s = 1.0 / scenario.rates.physics_hz
-        self.x = initial_state(scenario.start.position_nwu_m, radians(scenario.start.yaw_deg), 0.0, n)
+        self._start = initial_state(scenario.start.position_nwu_m, radians(scenario.start.yaw_deg), 0.0, n)
+        self.x = self._start.copy()
         self.plant = plant_parameters(airframe, scenario.offnominal, scenario.ground_contact, n)
         self.field = WindField(scenario.wind, n, self.dt_s)
         self.wind = np.zeros((3, n))
@@ -53,6 +54,7 @@ class Simulation:
         self._wind_block = np.zeros((0, 0, n))
         self._draw()
         self._measure()
+        self._warm_up()
 
     def set_demand(self, j: int, setpoint: Setpoint | None) -> None:
         """What vehicle `j`'s inner loops follow during the next tick; None stops its rotors."""
@@ -72,6 +74,10 @@ class Simulation:
         else:
             demand[tick.KIND, j] = tick.TORQUE_KIND
             demand[tick.TORQUE : tick.TORQUE + 3, j] = setpoint.torque
+
+    def put_back(self) -> None:
+        """At rest at the start pose, rotors still; time, wind and sensors go on."""
+        self.x[:] = self._start
 
     def advance(self) -> None:
         """One control period: the inner loops and the physics at the physics rate, then the sensors."""
@@ -95,6 +101,16 @@ class Simulation:
         self._sensor_block = np.stack(
             [g.standard_normal((BLOCK_TICKS, sensor_rows)) for g in self._sensor_generators], axis=-1
         )
+
+    def _warm_up(self) -> None:
+        """Run each kernel once on copies, so that compiling, or reading the cache, is done before the clock runs."""
+        arrays = (self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._command)
+        field, block = self.field, (self._wind_block[0], self._sensor_block[0])
+        copies = [array.copy() for array in arrays]
+        wind = (field.state.copy(), field.coefficients, self.wind.copy())
+        for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
+            copies[2][tick.KIND] = kind
+            tick.advance(*copies, *wind, *block, self.sigma, 0.0, self.dt_s, self.substeps)
 
     def _measure(self) -> None:
         normals = np.stack([g.standard_normal(tick.MEASURE_NORMALS) for g in self._sensor_generators], axis=-1)

@@ -89,7 +89,10 @@ def inner_loops(
     dt_s: float,
     command: Array,
 ) -> None:
-    """Rate PID (PX4's form) and allocation (eq 12 inverted) for one physics step: fills `command` (4, n), rotor speeds."""
+    """Rate PID (PX4's form) and allocation (eq 12 inverted) for one physics step.
+
+    Fills `command` (4, n), rotor speeds.
+    """
     for j in range(x.shape[1]):
         kind = demand[KIND, j]
         if kind == STOPPED:
@@ -142,7 +145,7 @@ def inner_loops(
 def measure(x: Array, sigma: Array, normals: Array, estimate: Array) -> None:
     """Gaussian white noise on every feedback variable: estimate (13, n) from truth and `normals` (12, n).
 
-    `sigma` (4,): position m, velocity m/s, attitude rad, rate rad/s. The attitude's noise is a small rotation in body axes.
+    `sigma` (4,): position m, velocity m/s, attitude rad, rate rad/s. The attitude's noise is a small turn in body axes.
     """
     for j in range(x.shape[1]):
         for i in range(3):

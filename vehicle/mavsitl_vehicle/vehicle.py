@@ -9,8 +9,9 @@ import numpy as np
 
 from mavsitl.control.inner_loop import InnerLoop
 from mavsitl.dialect import mavlink
-from mavsitl.frames import flip_quaternion, flip_vector
+from mavsitl.frames import flip_quaternion
 from mavsitl.log import topics
+from mavsitl.log.block import Array, Block, ned
 from mavsitl.log.ulog import Recorder
 from mavsitl.quaternion import to_euler
 from mavsitl.scenario import Flight
@@ -23,7 +24,7 @@ from mavsitl_vehicle.simulation import Simulation
 
 
 class Vehicle:
-    """One vehicle. `receive` datagrams at any time; `step` once a control period; then take `datagrams` of each port."""
+    """One vehicle. `receive` datagrams at any time; `step` once a control period; then take each port's `datagrams`."""
 
     def __init__(
         self,
@@ -35,7 +36,7 @@ class Vehicle:
         ports: Sequence[str] = ("offboard",),
         lockstep: bool = False,
     ) -> None:
-        """`ports` name the links in order: "offboard", "gcs". In `lockstep` the state is streamed every tick from the first."""
+        """`ports` name the links in order: "offboard", "gcs". In `lockstep` the state is streamed from the first tick."""
         self.period_us = flight.scenario.rates.control_period_us
         self.autopilot = Autopilot(flight, system_id, ports)
         self.simulation = Simulation(flight, self.autopilot.parameters, seed)
@@ -46,6 +47,9 @@ class Vehicle:
         """The PIDNN aboard, at level `attitude` with inner = "pidnn"."""
         if flight.scenario.controller.inner == "pidnn":
             self._seated = InnerLoop(flight.scenario.controller, flight.airframe, self.period_us / 1e6)
+            zero = np.zeros((3, 1))
+            self._seated.update(zero, zero, zero)  # compiles, or reads the cache, before the clock runs
+            self._seated.reset()
         self._now_us = -self.period_us
         self._done = False
         if lockstep:
@@ -94,9 +98,19 @@ class Vehicle:
         autopilot.true_wind = (wind[0], wind[1], wind[2])
         autopilot.observe(now_us)
         autopilot.report(now_us)
-        self._record.write(now_us, self, estimate, wind)
+        self._record.write(now_us, self)
         if autopilot.released_us is not None and not autopilot.commander.armed:
             self._done = True
+            self._after_flight()
+
+    def _after_flight(self) -> None:
+        """Ready for the next: where the flight began in a clamp, the clamp takes the vehicle back."""
+        if self._flight.scenario.start.clamp:
+            self.simulation.put_back()
+            self.autopilot.held = True
+            self.autopilot.landed_state = mavlink.MAV_LANDED_STATE_ON_GROUND
+        if self.autopilot.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND:
+            self.autopilot.released_us = None
 
     def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
         """What goes out on a link: one message a datagram, or all of a tick in one (`combine`)."""
@@ -127,42 +141,49 @@ _STATE_MESSAGES = {
 }
 
 
+# Columns of the vehicle's log block.
+_TRUTH = slice(0, 17)
+_ESTIMATE = slice(17, 30)
+_WIND = slice(30, 33)
+_INNER = slice(33, 37)
+_THRUST = 37
+_WIDTH = 38
+
+
 class _Record:
     """The vehicle's log: truth beside estimate every tick, states when they change."""
 
     def __init__(self, recorder: Recorder, flight: Flight) -> None:
-        self._position_truth = recorder.topic(topics.LOCAL_POSITION_TRUTH)
-        self._attitude_truth = recorder.topic(topics.ATTITUDE_TRUTH)
-        self._rate_truth = recorder.topic(topics.ANGULAR_VELOCITY_TRUTH)
-        self._position = recorder.topic(topics.LOCAL_POSITION)
-        self._attitude = recorder.topic(topics.ATTITUDE)
-        self._rate = recorder.topic(topics.ANGULAR_VELOCITY)
-        self._wind = recorder.topic(topics.WIND_TRUTH)
-        self._motors = recorder.topic(topics.ACTUATOR_MOTORS)
-        self._rotors = recorder.topic(topics.ROTOR_STATUS)
-        self._rates_setpoint = recorder.topic(topics.RATES_SETPOINT)
+        largest = flight.airframe.max_rotor_speed_rad_s
+        self._block = Block(
+            recorder,
+            _WIDTH,
+            (
+                (topics.LOCAL_POSITION_TRUTH, lambda v: np.hstack((ned(v[:, 0:3]), ned(v[:, 3:6])))),
+                (topics.ATTITUDE_TRUTH, lambda v: np.column_stack(flip_quaternion(*v[:, 6:10].T))),
+                (topics.ANGULAR_VELOCITY_TRUTH, lambda v: ned(v[:, 10:13])),
+                (topics.LOCAL_POSITION, lambda v: np.hstack((ned(v[:, 17:20]), ned(v[:, 20:23])))),
+                (topics.ATTITUDE, lambda v: np.column_stack(flip_quaternion(*v[:, 23:27].T))),
+                (topics.ANGULAR_VELOCITY, lambda v: ned(v[:, 27:30])),
+                (topics.WIND_TRUTH, lambda v: ned(v[:, _WIND])),
+                (topics.ACTUATOR_MOTORS, lambda v: v[:, 13:17] / largest),
+                (topics.ROTOR_STATUS, lambda v: np.column_stack((v[:, 13:17], v[:, 36]))),
+                (topics.RATES_SETPOINT, lambda v: np.column_stack((ned(v[:, 33:36]), _thrust_frd(v[:, _THRUST])))),
+            ),
+        )
         self._status = recorder.topic(topics.VEHICLE_STATUS)
         self._land = recorder.topic(topics.LAND_DETECTED)
-        self._largest_speed = flight.airframe.max_rotor_speed_rad_s
         self._last_status: tuple[int, int, int] | None = None
         self._last_land: int | None = None
 
-    def write(self, now_us: int, vehicle: Vehicle, e: list[float], wind: list[float]) -> None:
+    def write(self, now_us: int, vehicle: Vehicle) -> None:
         simulation, autopilot = vehicle.simulation, vehicle.autopilot
-        x = simulation.x[:, 0].tolist()
-        self._position_truth.append(now_us, *flip_vector(x[0], x[1], x[2]), *flip_vector(x[3], x[4], x[5]))
-        self._attitude_truth.append(now_us, *flip_quaternion(x[6], x[7], x[8], x[9]))
-        self._rate_truth.append(now_us, *flip_vector(x[10], x[11], x[12]))
-        self._position.append(now_us, *flip_vector(e[0], e[1], e[2]), *flip_vector(e[3], e[4], e[5]))
-        self._attitude.append(now_us, *flip_quaternion(e[6], e[7], e[8], e[9]))
-        self._rate.append(now_us, *flip_vector(e[10], e[11], e[12]))
-        self._wind.append(now_us, *flip_vector(wind[0], wind[1], wind[2]))
-        limit = self._largest_speed
-        self._motors.append(now_us, x[13] / limit, x[14] / limit, x[15] / limit, x[16] / limit)
-        inner = simulation.inner[:, 0].tolist()
-        self._rotors.append(now_us, x[13], x[14], x[15], x[16], int(inner[tick.SATURATED]))
-        thrust = float(simulation.demand[tick.THRUST, 0])
-        self._rates_setpoint.append(now_us, *flip_vector(inner[6], inner[7], inner[8]), 0.0, 0.0, -thrust)
+        row = self._block.row(now_us)
+        row[_TRUTH] = simulation.x[:, 0]
+        row[_ESTIMATE] = simulation.estimate[:, 0]
+        row[_WIND] = simulation.wind[:, 0]
+        row[_INNER] = simulation.inner[tick.RATE_SETPOINT : tick.SATURATED + 1, 0]
+        row[_THRUST] = simulation.demand[tick.THRUST, 0]
         commander = autopilot.commander
         status = (2 if commander.armed else 1, modes.TABLE[commander.mode].nav_state, int(commander.failsafe))
         if status != self._last_status:
@@ -172,6 +193,12 @@ class _Record:
         if landed != self._last_land:
             self._last_land = landed
             self._land.append(now_us, landed, landed)
+
+
+def _thrust_frd(thrust: Array) -> Array:
+    """PX4's thrust_body: (0, 0, -thrust), (k, 3)."""
+    zero = np.zeros_like(thrust)
+    return np.column_stack((zero, zero, -thrust))
 
 
 def build(flight: Flight, recorder: Recorder, **options: Any) -> Vehicle:

@@ -1,4 +1,4 @@
-"""One autopilot: MAVLink in, decisions, MAVLink out. It sees the vehicle through `estimate` and acts through `Demand`."""
+"""One autopilot: MAVLink in, decisions, MAVLink out. It sees through `estimate` and acts through `Demand`."""
 
 from __future__ import annotations
 
@@ -71,7 +71,9 @@ class Autopilot:
         period_s = scenario.rates.control_period_us / 1e6
         self._position_control = PositionControl(self.parameters, airframe.gravity_m_s2, self._hover_thrust, period_s)
         self._position_mode: Mode | None = None
-        self._texts: list[tuple[int, str]] = []
+        self._texts: list[tuple[int, int, str]] = []
+        """(id that joins its chunks, MAV_SEVERITY, text)"""
+        self._text_id = 0
         self._refusal_text_us = -REFUSAL_TEXT_INTERVAL_US
         self._shown: tuple[Mode, bool, bool, int] | None = None
         self._still_since_us: int | None = None
@@ -105,9 +107,8 @@ class Autopilot:
                     self._command_port = port
                     command, result = self._commands.receive(message, frame.system_id, frame.component_id, now_us)
                     port.node.send(telemetry.COMMAND_ACK, command, result, 0, 0, frame.system_id, frame.component_id)
-            elif handler := self._handlers.get(type(message).id):
-                if self._is_ours(port, frame):
-                    handler(message, now_us, frame.system_id)
+            elif (handler := self._handlers.get(type(message).id)) and self._is_ours(port, frame):
+                handler(message, now_us, frame.system_id)
         return len(frames)
 
     def _is_ours(self, port: Port, frame: Any) -> bool:
@@ -177,8 +178,10 @@ class Autopilot:
         message_id, interval_us = command.integer(1), command.integer(2)
         if message_id not in telemetry.BY_ID:
             return self._deny(f"Message interval refused: no stream of message {command.params[0]:g}")
-        if interval_us is None or interval_us < -1:
-            return self._deny(f"Message interval refused: {command.params[1]:g} us, need -1, 0 or more")
+        if interval_us is None or not -1 <= interval_us <= telemetry.MAX_INTERVAL_US:
+            return self._deny(
+                f"Message interval refused: {command.params[1]:g} us, need -1 to {telemetry.MAX_INTERVAL_US}"
+            )
         if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT and interval_us != 0:
             return self._deny("Message interval refused: HEARTBEAT stays at its rate")
         if interval_us == -1:
@@ -191,8 +194,11 @@ class Autopilot:
         message_id = command.integer(1)
         if message_id is None or not 0 <= message_id <= 65535:
             return self._deny(f"Message interval refused: no message {command.params[0]:g}")
-        interval = port.schedule.interval_us(message_id) if message_id in telemetry.BY_ID else telemetry.NEVER
-        port.node.send(telemetry.MESSAGE_INTERVAL, message_id, interval if interval else -1)
+        if message_id in telemetry.BY_ID:
+            interval_us = port.schedule.interval_us(message_id) or -1
+        else:
+            interval_us = 0  # MAVLink: not available
+        port.node.send(telemetry.MESSAGE_INTERVAL, message_id, interval_us)
         return commanding.ACCEPTED
 
     def _request_message(self, command: Command, now_us: int, port: Port) -> int:
@@ -215,22 +221,24 @@ class Autopilot:
         if not commander.armed:
             self._position_mode = None
             return None
+        on_ground = self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
         if commander.mode is Mode.OFFBOARD:
             self._position_mode = None
-            return self.setpoint
+            waiting = on_ground and not self.held and not commander.spooled_up(now_us)
+            return None if waiting else self.setpoint
+        if on_ground:
+            self._position_mode = None
+            return None
         e = self.estimate
         if self._position_mode is not commander.mode:
-            if self._position_mode is None:
-                _, _, yaw_rad = to_euler((e[6], e[7], e[8], e[9]))
-                self._position_control.engage((e[0], e[1], e[2]), yaw_rad)
+            _, _, yaw_rad = to_euler((e[6], e[7], e[8], e[9]))
+            self._position_control.engage((e[0], e[1], e[2]), yaw_rad, afresh=self._position_mode is None)
             self._position_mode = commander.mode
-        if self.released_us is None:
-            return None
         descend = commander.mode is Mode.LAND
         return self._position_control.update((e[0], e[1], e[2]), (e[3], e[4], e[5]), descend)
 
     def observe(self, now_us: int) -> None:
-        """After the physics, with the new estimate: is the vehicle on the ground, in the clamp, taking off, in the air?"""
+        """After the physics, with the new estimate: is it on the ground, in the clamp, taking off, in the air?"""
         commander = self.commander
         if not commander.armed:
             if self.landed_state != mavlink.MAV_LANDED_STATE_ON_GROUND and not self.held:
@@ -269,8 +277,8 @@ class Autopilot:
         self._shown = shown
         texts, self._texts = self._texts, []
         for port in self.ports:
-            for severity, text in texts:
-                port.node.send(telemetry.STATUSTEXT, severity, text.encode("ascii", "replace")[:50], 0, 0)
+            for text_id, severity, text in texts:
+                telemetry.send_text(port.node, severity, text, text_id)
             if changed:
                 telemetry.send_heartbeat(self, port.node, now_us)
                 telemetry.send_extended_sys_state(self, port.node, now_us)
@@ -282,4 +290,5 @@ class Autopilot:
         self.commander.step(now_us, Situation(landed=landed, setpoint_age_us=age))
 
     def _queue_text(self, severity: int, text: str) -> None:
-        self._texts.append((severity, text))
+        self._text_id = self._text_id % 65535 + 1
+        self._texts.append((self._text_id, severity, text))

@@ -16,7 +16,7 @@ DENIED: int = mavlink.MAV_RESULT_DENIED
 UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 
 FORCE_MAGIC = (21196, 2989)
-"""param2 of MAV_CMD_COMPONENT_ARM_DISARM that forces: PX4's number, and the one that MAVProxy and QGroundControl send."""
+"""param2 of MAV_CMD_COMPONENT_ARM_DISARM that forces: PX4's number, and the one MAVProxy and QGroundControl send."""
 
 Report = Callable[[int, str], None]
 """(MAV_SEVERITY, text): goes out as a STATUSTEXT."""
@@ -24,7 +24,10 @@ Report = Callable[[int, str], None]
 HOLD, LAND, DISARM = "hold", "land", "disarm"
 
 OFFBOARD_LOSS_ACTION = {0: LAND, 1: LAND, 2: LAND, 3: LAND, 4: LAND, 5: HOLD, 6: DISARM, 7: DISARM}
-"""COM_OBL_RC_ACT to what happens: stick modes without sticks and return fall down PX4's list to land, as their modes cannot run."""
+"""COM_OBL_RC_ACT to what happens.
+
+Stick modes without sticks and return fall down PX4's list to land, as their modes cannot run.
+"""
 
 
 class Situation(NamedTuple):

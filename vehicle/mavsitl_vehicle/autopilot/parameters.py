@@ -1,4 +1,4 @@
-"""The vehicle's parameters: PX4's names where the meaning is PX4's. One table; a scenario or an airframe overrides values."""
+"""The vehicle's parameters: PX4's names where the meaning is PX4's. One table; scenario or airframe override values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ class Parameter(NamedTuple):
 
 TABLE: dict[str, Parameter] = {
     "COM_OF_LOSS_T": Parameter(1.0, 0.0, 60.0, "s", "Off-board stream counts as lost after this silence"),
-    "COM_OBL_RC_ACT": Parameter(0, 0, 7, "", "Action on off-board loss: 0-2 stick modes, 3 return, 4 land, 5 hold, 7 disarm"),
+    "COM_OBL_RC_ACT": Parameter(
+        0, 0, 7, "", "Action on off-board loss: 0-2 stick modes, 3 return, 4 land, 5 hold, 7 disarm"
+    ),
     "COM_DISARM_LAND": Parameter(2.0, -1.0, 20.0, "s", "Auto-disarm after landing; negative: never"),
     "COM_DISARM_PRFLT": Parameter(10.0, -1.0, 60.0, "s", "Auto-disarm when armed and not taken off; negative: never"),
     "COM_SPOOLUP_TIME": Parameter(1.0, 0.0, 30.0, "s", "From arming to rotors at speed"),
@@ -77,6 +79,7 @@ class Parameters:
         if not parameter.minimum <= value <= parameter.maximum:
             unit = f" {parameter.unit}" if parameter.unit else ""
             raise ScenarioError(
-                f"parameters.{name}: {value:g}{unit} is not allowed; allowed: {parameter.minimum:g} to {parameter.maximum:g}{unit}"
+                f"parameters.{name}: {value:g}{unit} is not allowed; "
+                f"allowed: {parameter.minimum:g} to {parameter.maximum:g}{unit}"
             )
         self._values[name] = float(value)

@@ -21,11 +21,12 @@ class PositionControl:
         self._hold: Vector = (0.0, 0.0, 0.0)
         self._yaw_rad = 0.0
 
-    def engage(self, position_nwu_m: Vector, yaw_rad: float) -> None:
-        """Take over here: hold this position and heading."""
+    def engage(self, position_nwu_m: Vector, yaw_rad: float, afresh: bool) -> None:
+        """Hold this position and heading; `afresh` forgets the integrals of the position mode flown before."""
         self._hold = position_nwu_m
         self._yaw_rad = yaw_rad
-        self._integral = [0.0, 0.0, 0.0]
+        if afresh:
+            self._integral = [0.0, 0.0, 0.0]
 
     def update(self, position_nwu_m: Vector, velocity_nwu_m_s: Vector, descend: bool) -> AttitudeSetpoint:
         """Hold the engaged position; with `descend`, sink at MPC_LAND_SPEED over it."""
@@ -59,7 +60,7 @@ class PositionControl:
 
 
 def _attitude(zx: float, zy: float, zz: float, yaw_rad: float) -> Quaternion:
-    """The attitude whose body z axis is the unit vector (zx, zy, zz), zz > 0, reached by the shortest turn from that heading."""
+    """The attitude whose body z axis is the unit vector (zx, zy, zz), zz > 0, by the shortest turn from that heading."""
     w = sqrt((1.0 + zz) / 2.0)
     x, y = -zy / (2.0 * w), zx / (2.0 * w)
     c, s = cos(yaw_rad / 2.0), sin(yaw_rad / 2.0)

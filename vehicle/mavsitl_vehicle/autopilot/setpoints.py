@@ -1,4 +1,4 @@
-"""Off-board setpoints: messages in, one setpoint or one refusal out. Signs are turned to FLU here, by `mavsitl.frames`."""
+"""Off-board setpoints: messages in, one setpoint or one refusal out. `mavsitl.frames` turns signs to FLU here."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NORM_TOLERANCE = 0.01
 
 
 class AttitudeSetpoint(NamedTuple):
-    """Hold `attitude` (FLU -> NWU); turn the heading at `yaw_rate_rad_s` about the world's z axis (NaN: not asked for)."""
+    """Hold `attitude` (FLU -> NWU); turn the heading at `yaw_rate_rad_s` about the world's z axis (NaN: not asked)."""
 
     attitude: Quaternion
     yaw_rate_rad_s: float
@@ -36,7 +36,7 @@ class RateSetpoint(NamedTuple):
 
 
 class TorqueSetpoint(NamedTuple):
-    """Body torque in shares of the airframe's largest (FLU, -1..1) and collective thrust (0..1): U_1..U_4 themselves."""
+    """Body torque in shares of the airframe's largest (FLU, -1..1) and collective thrust (0..1): U_1..U_4."""
 
     torque: Vector
     thrust: float
@@ -54,10 +54,10 @@ class Refusal(NamedTuple):
 def from_attitude_target(message: Any) -> Setpoint | Refusal:
     """SET_ATTITUDE_TARGET, PX4's reading of `type_mask`.
 
-    The attitude is used unless ATTITUDE_IGNORE is set, and then a body yaw rate that is not ignored feeds its yaw forward.
-    Otherwise body rates are used if neither roll nor pitch rate is ignored. THROTTLE_IGNORE means zero thrust. Fields that
-    the mask leaves out are not looked at; a used field that is not finite, or a quaternion that is not of unit length,
-    refuses the whole message.
+    The attitude is used unless ATTITUDE_IGNORE is set, and then a body yaw rate that is not ignored feeds its yaw
+    forward. Otherwise body rates are used if neither roll nor pitch rate is ignored. THROTTLE_IGNORE means zero thrust.
+    Fields that the mask leaves out are not looked at; a used field that is not finite, or a quaternion that is not of
+    unit length, refuses the whole message.
     """
     mask: int = message.type_mask
     if mask & THRUST_BODY_SET:
@@ -87,7 +87,7 @@ def from_attitude_target(message: Any) -> Setpoint | Refusal:
 
 
 def from_actuator_control_target(message: Any) -> Setpoint | Refusal:
-    """SET_ACTUATOR_CONTROL_TARGET, group 0: roll, pitch, yaw torque (FRD, -1..1) and thrust (0..1), clipped to range."""
+    """SET_ACTUATOR_CONTROL_TARGET, group 0: roll, pitch, yaw torque (FRD, -1..1), thrust (0..1), clipped to range."""
     if message.group_mlx != 0:
         return Refusal(f"SET_ACTUATOR_CONTROL_TARGET refused: group {message.group_mlx}, only group 0 is flown")
     roll, pitch, yaw, thrust = message.controls[:4]

@@ -51,6 +51,11 @@ CAPABILITIES = (
 )
 """What is served, and nothing more: clients act on these bits."""
 
+TEXT_BYTES = 50
+"""STATUSTEXT.text; longer texts go in chunks."""
+MAX_INTERVAL_US = 2**31 - 1
+"""The longest that MESSAGE_INTERVAL can report."""
+
 _NO_COVARIANCE = [float("nan")] + [0.0] * 20
 _NAN = float("nan")
 
@@ -102,7 +107,7 @@ def send_local_position(autopilot: Autopilot, node: Node, now_us: int) -> None:
 
 
 def send_odometry(autopilot: Autopilot, node: Node, now_us: int) -> None:
-    """PX4's frames: pose in LOCAL_NED, velocity in LOCAL_NED (child_frame_id), body rates in FRD; covariance not given."""
+    """PX4's frames: pose in LOCAL_NED, velocity in LOCAL_NED (child_frame_id), body rates in FRD; no covariance."""
     e = autopilot.estimate
     node.send(
         ODOMETRY,
@@ -135,6 +140,16 @@ def send_autopilot_version(autopilot: Autopilot, node: Node, now_us: int) -> Non
         CAPABILITIES, _flight_sw_version(), middleware, 0, 0,
         list(b"mavsitl\0"), [0] * 8, [0] * 8, 0, 0, uid, list(uid.to_bytes(8, "big")) + [0] * 10,
     )  # fmt: skip
+
+
+def send_text(node: Node, severity: int, text: str, text_id: int) -> None:
+    """STATUSTEXT; a long one in chunks under `text_id` (1 to 65535), of which the last is the one that is not full."""
+    data = text.encode("ascii", "replace")
+    if len(data) <= TEXT_BYTES:
+        node.send(STATUSTEXT, severity, data, 0, 0)
+        return
+    for chunk, begin in enumerate(range(0, len(data) + 1, TEXT_BYTES)):
+        node.send(STATUSTEXT, severity, data[begin : begin + TEXT_BYTES], text_id, chunk)
 
 
 class Stream(NamedTuple):

@@ -1,0 +1,111 @@
+"""Recorders that keep running sums only: the paper's measures of a flight of any length in constant memory.
+
+The rows of a short stretch are joined by `FlightData` as those of a whole flight are, added to the sums and dropped.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mavsitl.log import topics
+from mavsitl.log.flight import FlightData, FlightError
+from mavsitl.log.ulog import MemoryRecorder
+from mavsitl.scenario import Flight
+
+LOST_M = 20.0
+"""A position error beyond this is a lost flight."""
+
+Six = tuple[float, float, float, float, float, float]
+
+
+class _Stretch(MemoryRecorder):
+    """Gives its rows away."""
+
+    def take(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
+        """The rows since the last time."""
+        tables = self.tables()
+        for _, sink in self._rows.values():
+            sink.offset = 0
+        return tables
+
+
+class Sums:
+    """`vehicle` and `ground` are the ends' recorders; `collect` between two ticks, when both have written the last.
+
+    Position errors in m (NWU), attitude errors in degrees, from the release to the end of the scenario's duration.
+    """
+
+    def __init__(self, flight: Flight) -> None:
+        self.vehicle = _Stretch()
+        self.ground = _Stretch()
+        self._duration_s = flight.scenario.duration_s
+        self._first_weights = first_weights(flight)
+        self._squares = np.zeros(6)
+        self._largest = np.zeros(6)
+        self._released_us: int | None = None
+        self.samples = 0
+        self.time_s = 0.0
+        """Of the newest sample, from the release."""
+        self.lost_s: float | None = None
+        """When the position error first passed `LOST_M` or was not finite; nothing is added from then on."""
+        self.weight_range = (1.0, 1.0)
+        """Least and largest output weight of the PIDNNs off board so far, in multiples of its initial value."""
+
+    @property
+    def rmse(self) -> Six | None:
+        """x, y, z in m, phi, theta, psi in degrees; None without a sample."""
+        return _six(np.sqrt(self._squares / self.samples)) if self.samples else None
+
+    @property
+    def largest(self) -> Six:
+        """Largest absolute errors so far, as `rmse`."""
+        return _six(self._largest)
+
+    def collect(self) -> None:
+        """Add what was recorded since the last time, and drop it."""
+        vehicle, ground = self.vehicle.take(), self.ground.take()
+        land = vehicle.pop(topics.LAND_DETECTED.name, None)
+        if self._released_us is None and land is not None and (land["landed"] == 0).any():
+            self._released_us = int(land["timestamp"][land["landed"] == 0][0])
+        if self._released_us is None or self.lost_s is not None:
+            return
+        vehicle[topics.LAND_DETECTED.name] = {
+            "timestamp": np.array([self._released_us], np.uint64),
+            "landed": np.zeros(1, np.uint8),
+        }
+        try:
+            stretch = FlightData.from_tables(vehicle, ground, duration_s=self._duration_s)
+        except FlightError:  # nothing of the flight in this stretch: before its first sample or after its last
+            return
+        position = stretch.position_error_nwu_m()
+        held = np.linalg.norm(position, axis=1) <= LOST_M  # false for NaN as well
+        count = len(held) if held.all() else int(np.argmin(held))
+        if count < len(held):
+            self.lost_s = float(stretch.time_s[count])
+        if not count:
+            return
+        errors = np.hstack((position, stretch.attitude_error_deg()))[:count]
+        self.samples += count
+        self.time_s = float(stretch.time_s[count - 1])
+        self._squares += np.sum(np.square(errors), axis=0)
+        self._largest = np.maximum(self._largest, np.max(np.abs(errors), axis=0))
+        if stretch.weights is not None:
+            known = self._first_weights > 0.0
+            ratios = (stretch.weights[:count] / np.where(known, self._first_weights, 1.0))[:, known]
+            low, high = self.weight_range
+            self.weight_range = (min(low, float(np.nanmin(ratios))), max(high, float(np.nanmax(ratios))))
+
+
+def first_weights(flight: Flight) -> npt.NDArray[np.float64]:
+    """(3 nets roll, pitch, yaw, 3 outputs P, I, D) with which the PIDNN is the PID (eqs 39, 42)."""
+    controller, period_s = flight.scenario.controller, flight.scenario.rates.control_period_us / 1e6
+    axes = (controller.roll_pitch, controller.roll_pitch, controller.yaw)
+    return np.array([[g.k_p_per_s2, g.k_i_per_s3 * period_s, g.k_d_per_s / period_s] for g in axes])
+
+
+def _six(values: npt.NDArray[np.float64]) -> Six:
+    x, y, z, phi, theta, psi = values.tolist()
+    return x, y, z, phi, theta, psi

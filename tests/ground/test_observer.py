@@ -1,0 +1,205 @@
+"""Telemetry to state: three ways to send one state, what is not taken, age and validity."""
+
+from __future__ import annotations
+
+from math import inf, nan, radians
+from typing import Any
+
+import numpy as np
+import pytest
+from mavsitl_ground.observer import Observer
+
+from mavsitl.dialect import mavlink
+from mavsitl.frames import flip_quaternion, flip_vector
+from mavsitl.quaternion import conjugate, from_euler, rotate
+
+ANGLES = (radians(20.0), radians(-10.0), radians(120.0))
+QUATERNION = from_euler(*ANGLES)
+POSITION = (1.0, -2.0, 3.5)
+VELOCITY = (0.5, 0.25, -0.75)
+OMEGA = (0.1, -0.2, 0.3)
+
+
+def odometry(stamp_us: int, *, child: int = mavlink.MAV_FRAME_LOCAL_NED, **other: Any) -> Any:
+    """The state above as PX4 sends it, or with fields of its own."""
+    attitude_ned = flip_quaternion(*QUATERNION)
+    velocity = flip_vector(*VELOCITY)
+    if child == mavlink.MAV_FRAME_BODY_FRD:
+        velocity = rotate(conjugate(attitude_ned), velocity)
+    fields: dict[str, Any] = {
+        **dict(zip("xyz", flip_vector(*POSITION), strict=True)),
+        "q": list(attitude_ned),
+        **dict(zip(("vx", "vy", "vz"), velocity, strict=True)),
+        **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), flip_vector(*OMEGA), strict=True)),
+        "frame_id": mavlink.MAV_FRAME_LOCAL_NED,
+    } | other
+    return mavlink.MAVLink_odometry_message(
+        time_usec=stamp_us, child_frame_id=child, pose_covariance=[nan] * 21, velocity_covariance=[nan] * 21, **fields
+    )
+
+
+def attitude(stamp_us: int) -> Any:
+    return mavlink.MAVLink_attitude_quaternion_message(
+        stamp_us // 1000, *flip_quaternion(*QUATERNION), *flip_vector(*OMEGA)
+    )
+
+
+def position(stamp_us: int) -> Any:
+    return mavlink.MAVLink_local_position_ned_message(
+        stamp_us // 1000, *flip_vector(*POSITION), *flip_vector(*VELOCITY)
+    )
+
+
+def state(observer: Observer) -> list[float]:
+    parts = (
+        observer.position_nwu_m,
+        observer.velocity_nwu_m_s,
+        observer.quaternion,
+        observer.angles_rad,
+        observer.omega_flu_rad_s,
+    )
+    return [float(value) for part in parts for value in part[:, 0]]
+
+
+EXPECTED = [*POSITION, *VELOCITY, *QUATERNION, *ANGLES, *OMEGA]
+
+
+@pytest.mark.parametrize("child", [mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD])
+def test_odometry_in_either_child_frame(child: int) -> None:
+    observer = Observer()
+    observer.receive(odometry(8000, child=child), 0)
+    assert state(observer) == pytest.approx(EXPECTED, abs=1e-12)
+    assert observer.stamp_us == 8000
+    assert observer.fresh
+
+
+@pytest.mark.parametrize("attitude_first", [True, False])
+def test_split_telemetry_is_the_same_state(attitude_first: bool) -> None:
+    observer = Observer()
+    first, second = (attitude, position) if attitude_first else (position, attitude)
+    observer.receive(first(8000), 0)
+    assert not observer.fresh
+    observer.receive(second(8000), 0)
+    assert observer.fresh
+    assert observer.stamp_us == 8000
+    assert state(observer) == pytest.approx(EXPECTED, abs=1e-12)
+
+
+def test_odometry_in_other_frames_is_ignored() -> None:
+    observer = Observer()
+    observer.receive(odometry(8000, child=mavlink.MAV_FRAME_GLOBAL), 0)
+    observer.receive(odometry(8000, frame_id=mavlink.MAV_FRAME_LOCAL_FLU), 0)
+    assert observer.stamp_us == -1
+    assert not observer.fresh
+
+
+BAD: dict[str, dict[str, Any]] = {
+    "NaN quaternion": {"q": [nan, 0.0, 0.0, 0.0]},
+    "zero quaternion": {"q": [0.0, 0.0, 0.0, 0.0]},
+    "infinite quaternion": {"q": [inf, 0.0, 0.0, 0.0]},
+    "quaternion of norm 1.1": {"q": [1.1, 0.0, 0.0, 0.0]},
+    "quaternion of norm 0.9": {"q": [0.9, 0.0, 0.0, 0.0]},
+    "NaN rate": {"pitchspeed": nan},
+    "NaN position": {"z": nan},
+    "infinite position": {"x": inf},
+    "opposite infinities": {"x": inf, "y": -inf},
+    "NaN velocity": {"vy": nan},
+}
+
+
+@pytest.mark.parametrize("child", [mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD])
+@pytest.mark.parametrize("bad", BAD.values(), ids=BAD.keys())
+def test_nothing_of_a_bad_message_is_taken(bad: dict[str, Any], child: int) -> None:
+    observer = Observer()
+    observer.receive(odometry(4000), 0)
+    observer.take()
+    before = state(observer)
+    observer.receive(odometry(8000, child=child, **({"x": 9.0, "vx": 9.0, "rollspeed": 9.0} | bad)), 4000)
+    assert state(observer) == before
+    assert observer.stamp_us == 4000
+    assert not observer.fresh
+
+
+@pytest.mark.parametrize("field", range(1, 8))
+def test_split_messages_that_are_not_finite_are_ignored(field: int) -> None:
+    observer = Observer()
+    observer.receive(attitude(4000), 0)
+    observer.receive(position(4000), 0)
+    before = state(observer)
+    values: list[Any] = [8, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    values[field] = nan
+    observer.receive(mavlink.MAVLink_attitude_quaternion_message(*values), 0)
+    if field < 7:
+        observer.receive(mavlink.MAVLink_local_position_ned_message(*values[:7]), 0)
+    assert state(observer) == before
+    assert observer.stamp_us == 4000
+
+
+def test_a_late_message_does_not_overwrite_a_newer_one() -> None:
+    observer = Observer()
+    observer.receive(odometry(900_000), 0)
+    observer.take()
+    before = state(observer)
+    observer.receive(odometry(896_000, x=50.0, vx=50.0, rollspeed=1.0), 0)
+    assert state(observer) == before
+    assert (observer.stamp_us, observer.fresh, observer.restarted) == (900_000, False, False)
+
+
+def test_the_same_stamp_again_is_not_fresh() -> None:
+    observer = Observer()
+    observer.receive(odometry(4000), 0)
+    observer.take()
+    observer.receive(odometry(4000), 0)
+    assert not observer.fresh
+
+
+@pytest.mark.parametrize("send", [odometry, attitude])
+def test_a_clock_that_goes_back_by_more_than_a_second_is_a_restart(send: Any) -> None:
+    observer = Observer()
+    observer.receive(odometry(5_000_000), 0)
+    observer.receive(position(5_000_000), 0)
+    observer.receive(send(4_000_000), 0)
+    assert not observer.restarted
+    observer.receive(send(3_999_000), 0)
+    assert observer.restarted
+    observer.reset()
+    assert not observer.restarted
+    observer.receive(odometry(0), 0)
+    assert observer.stamp_us == 0
+    assert observer.fresh
+
+
+def test_an_attitude_without_a_position_near_it_is_not_fresh() -> None:
+    observer = Observer(max_age_us=500_000)
+    observer.receive(position(100_000), 0)
+    observer.receive(attitude(600_000), 0)
+    assert observer.fresh
+    observer.take()
+    observer.receive(attitude(601_000), 0)
+    assert not observer.fresh
+
+
+def test_age_and_validity_are_by_the_ground_s_clock() -> None:
+    observer = Observer(max_age_us=500_000)
+    assert observer.age_us(7_000_000) is None
+    assert not observer.valid(7_000_000)
+    observer.receive(odometry(4000), 7_000_000)
+    assert observer.age_us(7_500_000) == 500_000
+    assert observer.valid(7_500_000)
+    assert not observer.valid(7_500_001)
+    observer.reset()
+    assert observer.age_us(7_500_000) is None
+
+
+def test_true_wind_is_turned_and_forgotten() -> None:
+    observer = Observer()
+    observer.receive(mavlink.MAVLink_debug_vect_message(b"OTHER", 0, 9.0, 9.0, 9.0), 0)
+    assert observer.true_wind_nwu_m_s is None
+    message = mavlink.MAVLink_debug_vect_message(b"WIND_TRUE", 0, 1.0, 2.0, 3.0)
+    message.name = "WIND_TRUE"  # as a decoded message has it
+    observer.receive(message, 0)
+    wind = observer.true_wind_nwu_m_s
+    assert wind is not None
+    np.testing.assert_array_equal(wind, [[1.0], [-2.0], [-3.0]])
+    observer.reset()
+    assert observer.true_wind_nwu_m_s is None
