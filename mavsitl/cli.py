@@ -322,9 +322,9 @@ def _settings(options: argparse.Namespace) -> list[str]:
     """All scenario options as KEY=VALUE, the form in which they are handed on to the processes."""
     settings = list(options.settings)
     named = {
-        "seed": options.seed, "airframe": options.airframe, "duration_s": options.duration,
+        "seed": options.seed, "airframe": options.airframe,
         "controller.law": options.law, "controller.level": options.level,
-        "controller.wind_information": options.wind_information,
+        "controller.wind_information": options.wind_information, "duration_s": options.duration,
     }  # fmt: skip
     for key, value in named.items():
         if value is not None:

@@ -1,7 +1,8 @@
 """Drivers: they move datagrams and time, and decide nothing. In memory, lock-step over UDP, real time over UDP.
 
 In lock-step all frames of one tick travel in one datagram each way, in memory and over UDP alike, so both put the same
-bytes on the wire. The vehicle advances when a setpoint echoes the stamp of its telemetry; a peer that stays silent is named.
+bytes on the wire. The vehicle advances when a setpoint echoes the stamp of its telemetry; a peer that stays silent is
+named.
 """
 
 from __future__ import annotations
@@ -110,7 +111,8 @@ class _Throttle:
 class _Pin:
     """Moves the process to one CPU at the first exchange.
 
-    Two that take turns never run at once and are faster on one core. Not before: until then each starts up, which two cores do faster. Does nothing where the system has no such call.
+    Two that take turns never run at once and are faster on one core. Not before: until then each starts up,
+    which two cores do faster. Does nothing where the system has no such call.
     """
 
     def __init__(self, cpu: int | None) -> None:
@@ -284,7 +286,7 @@ def run_realtime_vehicle(
     stop: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
 ) -> RealTime:
-    """The vehicle on the wall clock, times `speed`. `links` are in the order of its ports; peers join by a valid frame."""
+    """The vehicle on the wall clock, times `speed`. `links` in the order of its ports; peers join by a valid frame."""
     clock = PacedClock(vehicle.period_us, speed)
     clock.start()
     throttle = _Throttle(progress)

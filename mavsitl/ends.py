@@ -36,7 +36,7 @@ class Outcome:
     """From the first exchange on."""
     wire_hash: str
     finished: bool
-    """The flight came to its end, rather than being stopped."""
+    """The flight came to its planned end: not stopped, not taken over."""
     frames: int
     """Valid frames received."""
     rejected: int
@@ -264,7 +264,7 @@ class _Watch:
             simulated_s=simulated_us / 1e6,
             wall_s=(monotonic_us() - (tap.started_us or self._start_us)) / 1e6,
             wire_hash=tap.wire.hexdigest(),
-            finished=self._core.finished,
+            finished=self._core.succeeded,
             frames=counters.frames,
             rejected=counters.rejected,
             lateness_us=lateness_us,

@@ -69,7 +69,7 @@ class Steady(Section, frozen=True, tag_field="model", tag="steady"):
 
 
 class Gust(Section, frozen=True, tag_field="model", tag="gust"):
-    """The 1-cosine gust of MIL-F-8785C: 0 before `start_s`, rising over `length_s` to its peak, then held or gone."""
+    """MIL-F-8785C's 1-cosine gust: 0 before `start_s`, rising over `length_s` to its amplitude, then held or gone."""
 
     velocity_nwu_m_s: Vector3
     start_s: NonNegative
@@ -460,8 +460,7 @@ def _check(scenario: Scenario, where: str) -> None:
     if 1000 % rates.control_hz:
         raise ScenarioError(
             f"{where}: rates.control_hz: one cycle of {rates.control_hz} Hz is not a whole number of milliseconds; "
-            "allowed: "
-            + ", ".join(str(hz) for hz in range(10, 1001) if 1000 % hz == 0)
+            "allowed: " + ", ".join(str(hz) for hz in range(10, 1001) if 1000 % hz == 0)
         )
     if MICROSECONDS_PER_SECOND % rates.physics_hz:
         raise ScenarioError(

@@ -47,7 +47,10 @@ SYS_STATE_INTERVAL_US = 200_000
 
 
 class Controller:
-    """The paper's nested loops (fig 3) for one vehicle, from state to demand; no message, no clock but its stamp."""
+    """The paper's nested loops (fig 3) for one vehicle, from state to demand.
+
+    No message, no clock but the vehicle's stamp.
+    """
 
     def __init__(self, flight: Flight) -> None:
         """Raises `ScenarioError` where the airframe does not say what the command level needs."""
@@ -193,7 +196,7 @@ class Ground:
         self._scenario = scenario
         self._level = scenario.controller.level
         self._node = Node(SYSTEM_ID, COMPONENT_ID)
-        self._observer = Observer()
+        self._observer = Observer(scenario.controller.telemetry)
         self._controller = Controller(flight)
         self._report = report
         messages = [(message_id, self.period_us) for message_id in STATE_MESSAGES[scenario.controller.telemetry]]

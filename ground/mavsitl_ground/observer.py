@@ -6,7 +6,7 @@ The ground's frame boundary in.
 from __future__ import annotations
 
 from math import isfinite
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -14,7 +14,10 @@ from mavsitl.dialect import mavlink
 from mavsitl.frames import flip_quaternion, flip_vector
 from mavsitl.quaternion import euler_rates, normalise, rotate, to_euler
 
-Frames = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
+SPLIT = (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+ODOMETRY = (mavlink.MAVLINK_MSG_ID_ODOMETRY,)
+Source: TypeAlias = Literal["any", "odometry", "split"]
+FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
 
 
 class Observer:
@@ -23,7 +26,9 @@ class Observer:
     `stamp_us` is the vehicle's clock at the newest attitude; `fresh` says that it is new since `take`.
     """
 
-    def __init__(self, max_age_us: int = 500_000) -> None:
+    def __init__(self, source: Source = "any", max_age_us: int = 500_000) -> None:
+        """`source`: two streams of one state are not mixed, so the other one is ignored."""
+        self._ignored: tuple[int, ...] = {"any": (), "odometry": SPLIT, "split": ODOMETRY}[source]
         self._max_age_us = max_age_us
         self.position_nwu_m = np.zeros((3, 1))
         self.velocity_nwu_m_s = np.zeros((3, 1))
@@ -63,8 +68,10 @@ class Observer:
         return age is not None and age <= self._max_age_us
 
     def receive(self, message: Any, now_us: int) -> None:
-        """A message of the vehicle; others than the four below are ignored, as is one with a value that is not finite."""
+        """A message of the vehicle; others than the four below are ignored, as is one with a non-finite value."""
         kind = type(message).id
+        if kind in self._ignored:
+            return
         if kind == mavlink.MAVLINK_MSG_ID_ODOMETRY:
             self._on_odometry(message, now_us)
         elif kind == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
@@ -79,7 +86,7 @@ class Observer:
             self.true_wind_nwu_m_s = np.array(flip_vector(message.x, message.y, message.z))[:, np.newaxis]
 
     def _on_odometry(self, message: Any, now_us: int) -> None:
-        if message.frame_id != mavlink.MAV_FRAME_LOCAL_NED or message.child_frame_id not in Frames:
+        if message.frame_id != mavlink.MAV_FRAME_LOCAL_NED or message.child_frame_id not in FRAMES:
             return
         q = tuple(message.q)
         rates = (message.rollspeed, message.pitchspeed, message.yawspeed)

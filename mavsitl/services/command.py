@@ -1,4 +1,4 @@
-"""The command protocol: COMMAND_LONG and COMMAND_INT in, one final COMMAND_ACK out; and the asking side, with retries."""
+"""The command protocol: COMMAND_LONG and COMMAND_INT in, one final COMMAND_ACK out; and the asker, with retries."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ import pytest
 
 from mavsitl.control.pidnn import Pidnn
 from mavsitl.scenario import Controller, load
-from tests.control.linear_loop import Shares, closed_loop, held_plant, spectral_radius, unstable
+from tests.control.linear_loop import Shares, closed_loop, held_plant, unstable
 
 CONTROLLER = Controller()
 GAINS = CONTROLLER.roll_pitch

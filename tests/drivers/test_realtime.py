@@ -129,7 +129,7 @@ def test_a_ground_flies_on_the_wall_clock(wall: Wall) -> None:
     assert ground.succeeded
     assert link.admitted
     assert tap.wire.hexdigest() != Tap().wire.hexdigest()
-    assert vehicle.flight_time_s == pytest.approx(1.0, abs=0.1)
+    assert ground.flight_time_s == pytest.approx(1.0, abs=0.1)
 
 
 def test_the_vehicle_ends_when_it_is_told_to(wall: Wall) -> None:

@@ -22,7 +22,7 @@ SATURATED_MASK = 0xFF
 
 
 class Simulation:
-    """Arrays have the fleet axis last: `x` (17, n) the truth, `estimate` (13, n) what the sensors say, `wind` (3, n)."""
+    """Arrays have the fleet axis last: `x` (17, n) the truth, `estimate` (13, n) what sensors say, `wind` (3, n)."""
 
     def __init__(self, flight: Flight, parameters: Parameters, seed: int, n: int = 1) -> None:
         scenario, airframe = flight.scenario, flight.airframe
@@ -104,13 +104,14 @@ class Simulation:
 
     def _warm_up(self) -> None:
         """Run each kernel once on copies, so that compiling, or reading the cache, is done before the clock runs."""
-        arrays = (self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._command)
-        field, block = self.field, (self._wind_block[0], self._sensor_block[0])
-        copies = [array.copy() for array in arrays]
-        wind = (field.state.copy(), field.coefficients, self.wind.copy())
+        x, estimate, demand, inner = self.x.copy(), self.estimate.copy(), self.demand.copy(), self.inner.copy()
         for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
-            copies[2][tick.KIND] = kind
-            tick.advance(*copies, *wind, *block, self.sigma, 0.0, self.dt_s, self.substeps)
+            demand[tick.KIND] = kind
+            tick.advance(
+                x, estimate, demand, self.gains, inner, self.held, self.plant, self._command.copy(),
+                self.field.state.copy(), self.field.coefficients, self.wind.copy(),
+                self._wind_block[0], self._sensor_block[0], self.sigma, 0.0, self.dt_s, self.substeps,
+            )  # fmt: skip
 
     def _measure(self) -> None:
         normals = np.stack([g.standard_normal(tick.MEASURE_NORMALS) for g in self._sensor_generators], axis=-1)

@@ -145,7 +145,8 @@ def inner_loops(
 def measure(x: Array, sigma: Array, normals: Array, estimate: Array) -> None:
     """Gaussian white noise on every feedback variable: estimate (13, n) from truth and `normals` (12, n).
 
-    `sigma` (4,): position m, velocity m/s, attitude rad, rate rad/s. The attitude's noise is a small turn in body axes.
+    `sigma` (4,): position m, velocity m/s, attitude rad, rate rad/s. The attitude's noise is a small
+    rotation in body axes.
     """
     for j in range(x.shape[1]):
         for i in range(3):

@@ -36,7 +36,10 @@ class Vehicle:
         ports: Sequence[str] = ("offboard",),
         lockstep: bool = False,
     ) -> None:
-        """`ports` name the links in order: "offboard", "gcs". In `lockstep` the state is streamed from the first tick."""
+        """`ports` name the links in order: "offboard", "gcs".
+
+        In `lockstep` the state is streamed every tick from the first.
+        """
         self.period_us = flight.scenario.rates.control_period_us
         self.autopilot = Autopilot(flight, system_id, ports)
         self.simulation = Simulation(flight, self.autopilot.parameters, seed)
@@ -65,6 +68,11 @@ class Vehicle:
     @property
     def finished(self) -> bool:
         """It has flown and is disarmed again."""
+        return self._done
+
+    @property
+    def succeeded(self) -> bool:
+        """As `finished`: for a vehicle every landing is one."""
         return self._done
 
     @property

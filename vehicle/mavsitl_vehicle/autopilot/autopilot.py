@@ -1,4 +1,4 @@
-"""One autopilot: MAVLink in, decisions, MAVLink out. It sees through `estimate` and acts through `Demand`."""
+"""One autopilot: MAVLink in, decisions, MAVLink out. It sees the vehicle by `estimate` and acts by `Demand`."""
 
 from __future__ import annotations
 

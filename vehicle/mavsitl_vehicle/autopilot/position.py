@@ -60,7 +60,7 @@ class PositionControl:
 
 
 def _attitude(zx: float, zy: float, zz: float, yaw_rad: float) -> Quaternion:
-    """The attitude whose body z axis is the unit vector (zx, zy, zz), zz > 0, by the shortest turn from that heading."""
+    """The attitude whose body z axis is the unit vector (zx, zy, zz), zz > 0: the shortest turn from that heading."""
     w = sqrt((1.0 + zz) / 2.0)
     x, y = -zy / (2.0 * w), zx / (2.0 * w)
     c, s = cos(yaw_rad / 2.0), sin(yaw_rad / 2.0)
