@@ -18,7 +18,7 @@ from mavsitl.control.inner_loop import InnerLoop
 from mavsitl.control.pid import PositionLoop
 from mavsitl.control.wind_observer import WindObserver, model_acceleration
 from mavsitl.dialect import mavlink
-from mavsitl.frames import flip_euler
+from mavsitl.frames import Vector, flip_euler
 from mavsitl.log import topics
 from mavsitl.log.block import Block, ned
 from mavsitl.log.ulog import Recorder
@@ -69,14 +69,15 @@ class Controller:
         self._wind_observer = WindObserver(
             settings.wind_observer.horizontal_rad_s, settings.wind_observer.vertical_rad_s
         )
-        self._rate_gain = _rate_gain(flight) if settings.level == "body_rate" else np.ones((3, 1))
+        self._rate_gain = _rate_gain(flight) if settings.level == "body_rate" else (1.0, 1.0, 1.0)
         tau = airframe.rotor_time_constant_s
         self._thrust_share = 1.0 - exp(-self._period_s / tau) if tau > 0.0 else 1.0
         area = np.pi * airframe.rotor_radius_m**2
         self._coupling = airframe.wind_coupling * sqrt(8.0 * airframe.air_density_kg_m3 * area) / airframe.mass_kg
-        self._position = np.zeros((3, 1))
-        self._velocity = np.zeros((3, 1))
-        self._acceleration = np.zeros((3, 1))
+        self._wanted = np.zeros(9)
+        self._position = self._wanted[0:3, np.newaxis]
+        self._velocity = self._wanted[3:6, np.newaxis]
+        self._acceleration = self._wanted[6:9, np.newaxis]
         self._model = np.zeros((3, 1))
         self._desired = np.zeros((3, 1))
         self._desired_rates = np.zeros((3, 1))
@@ -110,7 +111,7 @@ class Controller:
         self._filter.reset()
         self._inner.reset()
         self._wind_observer.reset()
-        self._acting_thrust[0] = self._airframe.weight_n
+        self._acting_n = self._acting_thrust[0] = self._airframe.weight_n
         self.thrust_n = self._airframe.weight_n
         self._stamp_us = -1
         self.wind_acceleration = self._no_wind
@@ -119,9 +120,7 @@ class Controller:
         """One control cycle at flight time `time_s`; fills thrust_n, desired_rad and omega_acceleration."""
         self.reference = self._reference.sample(time_s)
         position, velocity, acceleration, yaw = self.reference
-        self._position[:, 0] = position
-        self._velocity[:, 0] = velocity
-        self._acceleration[:, 0] = acceleration
+        self._wanted[:] = (*position, *velocity, *acceleration)
         self.wind_acceleration = self._wind(state)
         thrust, phi, theta = self._outer.update(
             state.position_nwu_m, state.velocity_nwu_m_s, state.quaternion,
@@ -140,12 +139,13 @@ class Controller:
 
     def _wind(self, state: Observer) -> Array:
         """W_1..W_3 of eq 11 by the scenario's source; the model includes the rotors' lag where the airframe has one."""
-        self._acting_thrust += self._thrust_share * (self.thrust_n - self._acting_thrust)
+        acting_n = self._acting_n + self._thrust_share * (self.thrust_n - self._acting_n)
+        self._acting_n = self._acting_thrust[0] = acting_n
         source = self._settings.wind_information
         if source == "oracle":
             if state.true_wind_nwu_m_s is None:
                 return self._no_wind
-            return self._coupling * sqrt(max(float(self._acting_thrust[0]), 0.0)) * state.true_wind_nwu_m_s
+            return self._coupling * sqrt(max(acting_n, 0.0)) * state.true_wind_nwu_m_s
         if source == "none":
             return self._no_wind
         airframe = self._airframe
@@ -154,18 +154,21 @@ class Controller:
         self._stamp_us = state.stamp_us
         return self._wind_observer.update(state.velocity_nwu_m_s, self._model, period_s)
 
-    def rates_flu_rad_s(self, state: Observer) -> Array:
+    def rates_flu_rad_s(self, state: Observer) -> Vector:
         """Level `body_rate`: the rates that make a proportional rate loop give the wanted angular acceleration."""
-        return state.omega_flu_rad_s + self.omega_acceleration / self._rate_gain
+        p, q, r = state.omega_flu_rad_s[:, 0].tolist()
+        to_p, to_q, to_r = self.omega_acceleration[:, 0].tolist()
+        k_p, k_q, k_r = self._rate_gain
+        return p + to_p / k_p, q + to_q / k_q, r + to_r / k_r
 
     def torque_shares(self) -> list[float]:
         shares: list[float] = self._inner.torque_shares(self.omega_acceleration)[:, 0].tolist()
         return shares
 
 
-def _rate_gain(flight: Flight) -> Array:
-    """Angular acceleration per rad/s of rate error of the vehicle's rate loop (3, 1), 1/s, from its MC_*RATE_P."""
-    airframe, gains = flight.airframe, []
+def _rate_gain(flight: Flight) -> Vector:
+    """Angular acceleration per rad/s of rate error of the vehicle's rate loop, 1/s, from its MC_*RATE_P."""
+    airframe, gains = flight.airframe, list[float]()
     parameters = airframe.parameters | flight.scenario.parameters
     for axis, torque, inertia in zip(
         ("ROLL", "PITCH", "YAW"), airframe.max_torque_n_m, airframe.inertia_kg_m2, strict=True
@@ -175,8 +178,8 @@ def _rate_gain(flight: Flight) -> Array:
             raise ScenarioError(
                 f"{flight.name}: parameters.{name}: level 'body_rate' needs it in the airframe or the scenario"
             )
-        gains.append([parameters[name] * torque / inertia])
-    return np.array(gains)
+        gains.append(parameters[name] * torque / inertia)
+    return gains[0], gains[1], gains[2]
 
 
 class Ground:
@@ -303,8 +306,7 @@ class Ground:
         if self._level == "attitude":
             demand.send_attitude(self._node, target, state.stamp_us, from_euler(phi, theta, psi), thrust)
         elif self._level == "body_rate":
-            p, q, r = controller.rates_flu_rad_s(state)[:, 0].tolist()
-            demand.send_rates(self._node, target, state.stamp_us, (p, q, r), thrust)
+            demand.send_rates(self._node, target, state.stamp_us, controller.rates_flu_rad_s(state), thrust)
         else:
             demand.send_torque(self._node, target, state.stamp_us, controller.torque_shares(), thrust)
         source = self._node.sources.get(target)
@@ -337,7 +339,7 @@ _U1 = 11
 _ACCELERATION = slice(12, 15)
 _WIND = slice(15, 18)
 _LINK = slice(18, 22)
-_WEIGHTS = slice(22, 31)  # roll P I D, pitch P I D, yaw P I D
+_WEIGHTS = slice(22, 31)  # (P, I, D) x (roll, pitch, yaw)
 _WIDTH = 31
 
 
@@ -359,7 +361,8 @@ class _Record:
             (topics.LINK_STATUS, lambda v: v[:, _LINK]),
         ]
         if with_weights:
-            columns.append((topics.PIDNN_WEIGHTS, lambda v: v[:, _WEIGHTS]))
+            by_net = [0, 3, 6, 1, 4, 7, 2, 5, 8]  # from (P, I, D) x (roll, pitch, yaw) to a net after another
+            columns.append((topics.PIDNN_WEIGHTS, lambda v: v[:, _WEIGHTS][:, by_net]))
         self._block = Block(recorder, _WIDTH, columns)
 
     def write(
@@ -375,7 +378,7 @@ class _Record:
         row[_WIND] = controller.wind_acceleration[:, 0]
         row[_LINK] = (counters.frames, lost, counters.rejected, state.age_us(now_us) or 0)
         if self._with_weights and controller.weights is not None:
-            row[_WEIGHTS] = controller.weights[:, :, 0].T.ravel()
+            row[_WEIGHTS] = controller.weights.reshape(9)
 
 
 def _attitude_setpoint(values: Array) -> Array:

@@ -30,12 +30,16 @@ class Observer:
         """`source`: two streams of one state are not mixed, so the other one is ignored."""
         self._ignored: tuple[int, ...] = {"any": (), "odometry": SPLIT, "split": ODOMETRY}[source]
         self._max_age_us = max_age_us
-        self.position_nwu_m = np.zeros((3, 1))
-        self.velocity_nwu_m_s = np.zeros((3, 1))
-        self.quaternion = np.array([[1.0], [0.0], [0.0], [0.0]])
-        self.angles_rad = np.zeros((3, 1))
-        self.omega_flu_rad_s = np.zeros((3, 1))
-        self.angle_rates_rad_s = np.zeros((3, 1))
+        # One array a message half, written at once; the names below are views of it.
+        self._linear = np.zeros(6)
+        self._angular = np.zeros(13)
+        self._angular[0] = 1.0
+        self.position_nwu_m = self._linear[0:3, np.newaxis]
+        self.velocity_nwu_m_s = self._linear[3:6, np.newaxis]
+        self.quaternion = self._angular[0:4, np.newaxis]
+        self.angles_rad = self._angular[4:7, np.newaxis]
+        self.omega_flu_rad_s = self._angular[7:10, np.newaxis]
+        self.angle_rates_rad_s = self._angular[10:13, np.newaxis]
         """Time derivatives of `angles_rad`, from the body rates."""
         self.true_wind_nwu_m_s: np.ndarray[Any, np.dtype[np.float64]] | None = None
         """From DEBUG_VECT "WIND_TRUE": the oracle's. None until one came."""
@@ -76,12 +80,13 @@ class Observer:
             self._on_odometry(message, now_us)
         elif kind == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
             q = (message.q1, message.q2, message.q3, message.q4)
-            self._attitude(
-                q, (message.rollspeed, message.pitchspeed, message.yawspeed), message.time_boot_ms * 1000, now_us
-            )
+            rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
+            if _is_attitude(q, rates):
+                self._attitude(q, rates, message.time_boot_ms * 1000, now_us)
         elif kind == mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
             position, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
-            self._position(position, velocity, message.time_boot_ms * 1000)
+            if isfinite(sum(position) + sum(velocity)):
+                self._position(position, velocity, message.time_boot_ms * 1000)
         elif kind == mavlink.MAVLINK_MSG_ID_DEBUG_VECT and message.name == "WIND_TRUE":
             self.true_wind_nwu_m_s = np.array(flip_vector(message.x, message.y, message.z))[:, np.newaxis]
 
@@ -100,28 +105,22 @@ class Observer:
         self._position(position, velocity, message.time_usec)
 
     def _attitude(self, q: Any, rates: Any, stamp_us: int, now_us: int) -> None:
-        if not _is_attitude(q, rates):
-            return
         if stamp_us < self.stamp_us:
             if self.stamp_us - stamp_us > 1_000_000:
                 self.restarted = True
             return
         unit = normalise(flip_quaternion(*q))
-        self.quaternion[:, 0] = unit
         angles = to_euler(unit)
-        self.angles_rad[:, 0] = angles
         omega = flip_vector(*rates)
-        self.omega_flu_rad_s[:, 0] = omega
-        self.angle_rates_rad_s[:, 0] = euler_rates(angles, omega)
+        self._angular[:] = (*unit, *angles, *omega, *euler_rates(angles, omega))
         self._fresh = self._fresh or stamp_us > self.stamp_us
         self.stamp_us = stamp_us
         self._received_us = now_us
 
     def _position(self, position: Any, velocity: Any, stamp_us: int) -> None:
-        if not isfinite(sum(position) + sum(velocity)) or stamp_us < self._position_us:
+        if stamp_us < self._position_us:
             return
-        self.position_nwu_m[:, 0] = flip_vector(*position)
-        self.velocity_nwu_m_s[:, 0] = flip_vector(*velocity)
+        self._linear[:] = (*flip_vector(*position), *flip_vector(*velocity))
         self._position_us = stamp_us
 
 

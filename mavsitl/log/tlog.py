@@ -16,6 +16,7 @@ _PREFIX = struct.Struct("<BI")
 _MAVLINK_1 = 0xFE
 _MAVLINK_2 = 0xFD
 _SIGNED = 0x01
+_HASH_CHUNK_BYTES = 16_384
 
 
 class Direction(IntEnum):
@@ -65,7 +66,10 @@ class TlogWriter:
     def write(self, timestamp_us: int, datagram: bytes) -> None:
         """Append the frames of one datagram, sent by either side at `timestamp_us`."""
         stamp = _STAMP.pack(timestamp_us)
-        split = frames(datagram)
+        if len(datagram) > 2 and datagram[0] == _MAVLINK_2 and not datagram[2] and len(datagram) == 12 + datagram[1]:
+            split = [datagram]  # one frame, as nearly always
+        else:
+            split = frames(datagram)
         self.left_out_bytes += len(datagram) - sum(map(len, split))
         try:
             self._file.write(b"".join(part for frame in split for part in (stamp, frame)))
@@ -101,15 +105,22 @@ class TlogWriter:
 class WireHash:
     """A running blake2b over (direction byte, uint32 length, datagram): runs that agree exchanged the same bytes."""
 
-    __slots__ = ("_hash",)
+    __slots__ = ("_hash", "_waiting")
 
     def __init__(self) -> None:
         self._hash = blake2b(digest_size=16)
+        self._waiting = bytearray()
 
     def update(self, direction: Direction, datagram: bytes) -> None:
-        self._hash.update(_PREFIX.pack(direction, len(datagram)))
-        self._hash.update(datagram)
+        waiting = self._waiting
+        waiting += _PREFIX.pack(direction, len(datagram))
+        waiting += datagram
+        if len(waiting) > _HASH_CHUNK_BYTES:
+            self._hash.update(waiting)
+            waiting.clear()
 
     def hexdigest(self) -> str:
         """32 hexadecimal digits, of everything so far."""
+        self._hash.update(self._waiting)
+        self._waiting.clear()
         return self._hash.hexdigest()

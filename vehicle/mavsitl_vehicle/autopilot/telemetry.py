@@ -181,6 +181,7 @@ class Schedule:
         self._offboard = offboard
         self._due: dict[int, int] = {}
         self._interval = {stream.message_id: self.default_us(stream.message_id) for stream in STREAMS}
+        self._active = self._list_active()
         self._next_us = 0
 
     def default_us(self, message_id: int) -> int:
@@ -194,6 +195,7 @@ class Schedule:
     def set_interval(self, message_id: int, interval_us: int, now_us: int) -> None:
         self._interval[message_id] = interval_us
         self._due[message_id] = now_us
+        self._active = self._list_active()
         self._next_us = 0
 
     def run(self, autopilot: Autopilot, node: Node, now_us: int) -> None:
@@ -201,14 +203,20 @@ class Schedule:
         if now_us < self._next_us:
             return
         nearest = now_us + HZ
-        for stream in STREAMS:
-            interval = self._interval[stream.message_id]
-            if interval == NEVER:
-                continue
-            due = self._due.get(stream.message_id, 0)
+        due_of = self._due
+        for message_id, send, interval in self._active:
+            due = due_of.get(message_id, 0)
             if now_us >= due:
-                stream.send(autopilot, node, now_us)
-                due = due + interval if due + interval > now_us else now_us + interval
-                self._due[stream.message_id] = due
-            nearest = min(nearest, due)
+                send(autopilot, node, now_us)
+                due += interval
+                if due <= now_us:
+                    due = now_us + interval
+                due_of[message_id] = due
+            if due < nearest:
+                nearest = due
         self._next_us = nearest
+
+    def _list_active(self) -> list[tuple[int, Sampler, int]]:
+        """Message id, sampler and interval of the streams that are on, in the table's order."""
+        interval = self._interval
+        return [(s.message_id, s.send, interval[s.message_id]) for s in STREAMS if interval[s.message_id] != NEVER]
