@@ -18,7 +18,7 @@ from mavsitl.control.inner_loop import InnerLoop
 from mavsitl.control.pid import PositionLoop
 from mavsitl.control.wind_observer import WindObserver, model_acceleration
 from mavsitl.dialect import mavlink
-from mavsitl.frames import Vector, flip_euler
+from mavsitl.frames import Quaternion, Vector, flip_euler
 from mavsitl.log import topics
 from mavsitl.log.block import Block, ned
 from mavsitl.log.ulog import Recorder
@@ -70,6 +70,7 @@ class Controller:
             settings.wind_observer.horizontal_rad_s, settings.wind_observer.vertical_rad_s
         )
         self._rate_gain = _rate_gain(flight) if settings.level == "body_rate" else (1.0, 1.0, 1.0)
+        self._lead_s = _attitude_lag_s(flight) if settings.level == "attitude" else 0.0
         tau = airframe.rotor_time_constant_s
         self._thrust_share = 1.0 - exp(-self._period_s / tau) if tau > 0.0 else 1.0
         area = np.pi * airframe.rotor_radius_m**2
@@ -161,9 +162,30 @@ class Controller:
         k_p, k_q, k_r = self._rate_gain
         return p + to_p / k_p, q + to_q / k_q, r + to_r / k_r
 
+    def attitude(self) -> Quaternion:
+        """Level `attitude`: the desired angles, leading by the known lag of the loop aboard, FLU -> NWU.
+
+        The loop aboard gets no angle rates over the wire, so without the lead it would follow phi_d late.
+        """
+        phi, theta, psi = self._desired[:, 0].tolist()
+        phi_rate, theta_rate, _ = self._desired_rates[:, 0].tolist()
+        return from_euler(phi + self._lead_s * phi_rate, theta + self._lead_s * theta_rate, psi)
+
     def torque_shares(self) -> list[float]:
         shares: list[float] = self._inner.torque_shares(self.omega_acceleration)[:, 0].tolist()
         return shares
+
+
+def _attitude_lag_s(flight: Flight) -> float:
+    """Lag of the attitude loop aboard behind a ramp, s: 1 / MC_ROLL_P for the stock one, none for the PIDNN (eq 28)."""
+    if flight.scenario.controller.inner == "pidnn":
+        return 0.0
+    gain = (flight.airframe.parameters | flight.scenario.parameters).get("MC_ROLL_P", 0.0)
+    if not gain > 0.0:
+        raise ScenarioError(
+            f"{flight.name}: parameters.MC_ROLL_P: level 'attitude' needs it in the airframe or scenario"
+        )
+    return 1.0 / gain
 
 
 def _rate_gain(flight: Flight) -> Vector:
@@ -302,9 +324,8 @@ class Ground:
         time_s = (state.stamp_us - self._released_us) / 1e6
         controller.update(time_s, state)
         thrust = controller.thrust_n / self._max_thrust_n
-        phi, theta, psi = controller.desired_rad[:, 0].tolist()
         if self._level == "attitude":
-            demand.send_attitude(self._node, target, state.stamp_us, from_euler(phi, theta, psi), thrust)
+            demand.send_attitude(self._node, target, state.stamp_us, controller.attitude(), thrust)
         elif self._level == "body_rate":
             demand.send_rates(self._node, target, state.stamp_us, controller.rates_flu_rad_s(state), thrust)
         else:

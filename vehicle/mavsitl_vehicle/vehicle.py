@@ -7,19 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from mavsitl.control.inner_loop import InnerLoop
 from mavsitl.dialect import mavlink
 from mavsitl.frames import flip_quaternion
 from mavsitl.log import topics
 from mavsitl.log.block import Array, Block, ned
 from mavsitl.log.ulog import Recorder
-from mavsitl.quaternion import to_euler
 from mavsitl.scenario import Flight
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot import modes
 from mavsitl_vehicle.autopilot.autopilot import Autopilot
 from mavsitl_vehicle.autopilot.modes import Mode
-from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint, TorqueSetpoint
+from mavsitl_vehicle.autopilot.seated import SeatedLaw
+from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint
 from mavsitl_vehicle.simulation import Simulation
 
 
@@ -46,13 +45,7 @@ class Vehicle:
         self._flight = flight
         self._recorder = recorder
         self._record = _Record(recorder, flight)
-        self._seated: InnerLoop | None = None
-        """The PIDNN aboard, at level `attitude` with inner = "pidnn"."""
-        if flight.scenario.controller.inner == "pidnn":
-            self._seated = InnerLoop(flight.scenario.controller, flight.airframe, self.period_us / 1e6)
-            zero = np.zeros((3, 1))
-            self._seated.update(zero, zero, zero)  # compiles, or reads the cache, before the clock runs
-            self._seated.reset()
+        self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._now_us = -self.period_us
         self._done = False
         if lockstep:
@@ -135,12 +128,7 @@ class Vehicle:
             return setpoint
         if self.autopilot.released_us is None:
             law.reset()
-        estimate = self.simulation.estimate
-        angles = np.array(to_euler(estimate[6:10, 0].tolist()))[:, np.newaxis]
-        desired = np.array(to_euler(setpoint.attitude))[:, np.newaxis]
-        acceleration = law.update(angles, estimate[10:13], desired)
-        roll, pitch, yaw = law.torque_shares(acceleration)[:, 0].tolist()
-        return TorqueSetpoint((roll, pitch, yaw), setpoint.thrust)
+        return law.update(setpoint, self.autopilot.setpoint_us or 0, self.simulation.estimate[:, 0])
 
 
 _STATE_MESSAGES = {
