@@ -288,7 +288,7 @@ def _add_end_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--cpu",
-        type=_whole(0, (os.cpu_count() or 1) - 1),
+        type=_whole(0, 4095),
         metavar="N",
         help="lock-step: run on this CPU from the first exchange on; the same for both is fastest",
     )
@@ -379,7 +379,8 @@ def _fly(options: argparse.Namespace) -> int:
     try:
         with bar:
             for index, (name, flight) in enumerate(zip(names, flights, strict=True)):
-                title = flight.name if names.count(name) == 1 else f"{flight.name}-{index + 1}"
+                alone = [other.name for other in flights].count(flight.name) == 1
+                title = flight.name if alone else f"{flight.name}-{index + 1}"
                 task = bar.add_task(f"{title:20s}", total=flight.scenario.duration_s, said="starting")
                 outcome, speed = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task, pair)
                 records.append(runs.record(flight, folder=title, wire_hash=outcome, real_time_factor=speed))
@@ -408,6 +409,8 @@ def _fly_one(
         from mavsitl import ends
 
         outcome = ends.in_memory(flight, folder, report=lambda text: bar.update(task, said=text), progress=move)
+        if not outcome.finished:
+            raise pair.PairError(f"{flight.name}: the flight did not end as planned")
         wire_hash, speed = outcome.wire_hash, outcome.speed
     else:
         result = pair.fly(name, settings, folder, on_event)
@@ -435,7 +438,8 @@ def _show(console: Any, options: argparse.Namespace, folder: Path, records: list
             facts = (
                 f"{record.law}, {record.level}, wind information: {_loud(record.wind_information)}, seed {record.seed}"
             )
-            table = Table(title=f"{record.title}  ({facts})", title_justify="left", title_style="bold")
+            console.print(f"\n[bold]{record.title}[/]  {facts}", soft_wrap=True, highlight=False)
+            table = Table()
             for column in ("RMSE", "ours", "paper", "ours / paper"):
                 table.add_column(column, justify="left" if column == "RMSE" else "right")
             for row in rows:

@@ -7,6 +7,8 @@ named.
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +21,8 @@ from mavsitl.log.tlog import Direction, TlogWriter, WireHash
 
 FIRST_REPEAT_S = 0.1
 """Lock-step: the first datagram is repeated this often until the other side is there."""
+MAX_OUT_OF_STEP = 1000
+"""Lock-step: datagrams of the other side within one tick without the setpoint that is waited for."""
 PROGRESS_INTERVAL_US = 100_000
 """Wall clock between two calls of a progress callback."""
 FLUSH_INTERVAL_US = 1_000_000
@@ -120,7 +124,8 @@ class _Pin:
 
     def __call__(self) -> None:
         if self._cpu is not None:
-            os.sched_setaffinity(0, {self._cpu})
+            with contextlib.suppress(OSError):  # a CPU that we may not use: then the system chooses
+                os.sched_setaffinity(0, {self._cpu})
             self._cpu = None
 
 
@@ -133,7 +138,7 @@ def fly_in_memory(
     ground: GroundCore,
     tap: Tap | None = None,
     *,
-    max_time_s: float = 36_000.0,
+    max_time_s: float = math.inf,
     progress: Progress | None = None,
 ) -> int:
     """Both ends in this process until both have finished; the microseconds simulated.
@@ -142,7 +147,7 @@ def fly_in_memory(
     """
     tap = tap or Tap()
     throttle = _Throttle(progress)
-    now_us, period_us, last_us = 0, vehicle.period_us, int(max_time_s * 1e6)
+    now_us, period_us, last_us = 0, vehicle.period_us, max_time_s * 1e6
     ground_us = 0
     while True:
         vehicle.step(now_us)
@@ -157,7 +162,7 @@ def fly_in_memory(
                     vehicle.receive(0, answer)
         if vehicle.finished and ground.finished:
             return now_us
-        if vehicle.token_us < now_us:
+        if vehicle.token_us != now_us:
             raise LockstepError(f"the ground did not answer the telemetry stamped {now_us} us")
         if now_us >= last_us:
             raise LockstepError(f"the flight did not end within {max_time_s:g} s of simulated time")
@@ -198,7 +203,8 @@ def run_lockstep_vehicle(
             return now_us
         limit_s = deadline_s if vehicle.token_us >= 0 else start_deadline_s
         patience = round(limit_s * repeat)
-        while vehicle.token_us < now_us:
+        out_of_step = 0
+        while vehicle.token_us != now_us:
             try:
                 answer = link.receive()
             except LinkSilent as silence:
@@ -213,6 +219,12 @@ def run_lockstep_vehicle(
             tap.hear(Direction.FROM_GROUND, now_us, answer)
             vehicle.receive(0, answer)
             pin()
+            out_of_step += 1
+            if out_of_step > MAX_OUT_OF_STEP:
+                raise LockstepError(
+                    f"lock-step stopped at t = {now_us / 1e6:g} s: the other side answers, but with setpoints stamped "
+                    f"{vehicle.token_us / 1e6:g} s; does it run --lockstep and echo the telemetry's stamp?"
+                )
         tap.tick(now_us)
         throttle(vehicle)
         now_us += period_us
@@ -271,6 +283,7 @@ class RealTime:
     """How a real-time run kept its time."""
 
     simulated_us: int
+    wall_us: int
     lateness: LatenessHistogram
     rebased: int
     """How often the run was more than a second late and the schedule was moved; simulated time never jumps."""
@@ -289,6 +302,7 @@ def run_realtime_vehicle(
     """The vehicle on the wall clock, times `speed`. `links` in the order of its ports; peers join by a valid frame."""
     clock = PacedClock(vehicle.period_us, speed)
     clock.start()
+    start_us = monotonic_us()
     throttle = _Throttle(progress)
     now_us = 0
     while not stop() and not (until_finished and vehicle.finished):
@@ -300,15 +314,16 @@ def run_realtime_vehicle(
                 link.send(datagram)
         clock.wait_until(now_us + vehicle.period_us)
         for port, link in enumerate(links):
-            for datagram, source in link.receive(now_us):
+            wall_us = monotonic_us()  # peers expire on the wall clock, whatever the simulated one does
+            for datagram, source in link.receive(wall_us):
                 if port == 0:
                     tap.hear(Direction.FROM_GROUND, now_us, datagram)
                 if vehicle.receive(port, datagram):
-                    link.admit(source, now_us)
+                    link.admit(source, wall_us)
         tap.tick(now_us)
         throttle(vehicle)
         now_us += vehicle.period_us
-    return RealTime(now_us, clock.lateness, clock.rebased)
+    return RealTime(now_us, monotonic_us() - start_us, clock.lateness, clock.rebased)
 
 
 def run_realtime_ground(
@@ -318,8 +333,13 @@ def run_realtime_ground(
     *,
     stop: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
-) -> None:
-    """The ground on the wall clock: it steps as soon as telemetry comes, and at least once a control period."""
+) -> tuple[int, int]:
+    """The ground on the wall clock: it steps as soon as telemetry comes, and at least once a control period.
+
+    Returns the microseconds that passed on the vehicle's clock and on the wall since the first state.
+    """
+    first: tuple[int, int] | None = None
+    last = (0, 0)
     throttle = _Throttle(progress)
     start_us = monotonic_us()
     period_s = ground.period_us / 1e6
@@ -331,8 +351,12 @@ def run_realtime_ground(
             if ground.receive(0, datagram):
                 link.admit(source, now_us)
         ground.step(now_us)
+        if ground.vehicle_time_us >= 0:
+            last = (ground.vehicle_time_us, now_us)
+            first = last if first is None or last[0] < first[0] else first
         for answer in ground.datagrams(0, combine=False):
             tap.hear(Direction.FROM_GROUND, now_us, answer)
             link.send(answer)
         tap.tick(now_us)
         throttle(ground)
+    return (0, 0) if first is None else (last[0] - first[0], last[1] - first[1])

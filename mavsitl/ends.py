@@ -33,7 +33,7 @@ class Outcome:
 
     simulated_s: float
     wall_s: float
-    """From the first exchange on."""
+    """Of the same stretch: in lock-step from the first exchange on, so that start-up is not in it."""
     wire_hash: str
     finished: bool
     """The flight came to its planned end: not stopped, not taken over."""
@@ -202,7 +202,7 @@ def vehicle_realtime(
                 core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, progress=progress
             )
             lateness = (timing.lateness.p50_us, timing.lateness.p99_us)
-            return watch.outcome(timing.simulated_us, tap, lateness, timing.rebased)
+            return watch.outcome(timing.simulated_us, tap, lateness, timing.rebased, wall_us=timing.wall_us)
     finally:
         for link in opened:
             link.close()
@@ -220,8 +220,8 @@ def ground_realtime(
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
-            drivers.run_realtime_ground(core, link, tap, stop=stop, progress=progress)
-            return watch.outcome(max(core.vehicle_time_us, 0), tap)
+            simulated_us, wall_us = drivers.run_realtime_ground(core, link, tap, stop=stop, progress=progress)
+            return watch.outcome(simulated_us, tap, wall_us=wall_us)
     finally:
         link.close()
 
@@ -244,7 +244,7 @@ def in_memory(
         tap.flush = flush
         vehicle = wings.find(wings.VEHICLE_GROUP)(flight, vehicle_recorder, seed=flight.scenario.seed, lockstep=True)
         ground = wings.find(wings.GROUND_GROUP)(flight, ground_recorder, report=report)
-        watch = _Watch(vehicle)
+        watch = _Watch(ground)
         end_us = drivers.fly_in_memory(vehicle, ground, tap, progress=progress)
         return watch.outcome(end_us, tap)
 
@@ -257,12 +257,20 @@ class _Watch:
         self._start_us = monotonic_us()
 
     def outcome(
-        self, simulated_us: int, tap: Tap, lateness_us: tuple[float, float] | None = None, rebased: int = 0
+        self,
+        simulated_us: int,
+        tap: Tap,
+        lateness_us: tuple[float, float] | None = None,
+        rebased: int = 0,
+        wall_us: int | None = None,
     ) -> Outcome:
+        """`wall_us`: None is since the first exchange."""
         counters = self._core.counters
+        if wall_us is None:
+            wall_us = monotonic_us() - (tap.started_us or self._start_us)
         return Outcome(
             simulated_s=simulated_us / 1e6,
-            wall_s=(monotonic_us() - (tap.started_us or self._start_us)) / 1e6,
+            wall_s=wall_us / 1e6,
             wire_hash=tap.wire.hexdigest(),
             finished=self._core.succeeded,
             frames=counters.frames,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import selectors
 import socket
 import subprocess
@@ -15,6 +16,10 @@ from typing import IO, Any
 import msgspec
 
 from mavsitl.link.udp import LOOPBACK
+from mavsitl.scenario import ScenarioError
+
+EXIT_USAGE = 2
+"""What an end exits with when its arguments or its scenario are wrong."""
 
 Event = dict[str, Any]
 OnEvent = Callable[[str, Event], None]
@@ -48,12 +53,13 @@ def free_ports(count: int) -> list[int]:
 def fly(scenario: str, settings: Sequence[str], folder: Path, on_event: OnEvent) -> Result:
     """Fly one scenario in lock-step; the logs go to `folder`. Both processes are ended whatever happens.
 
-    `settings` are ``--set`` arguments. Raises `PairError` with the text of the end that failed.
+    `settings` are ``--set`` arguments. Raises `PairError` with the text of the end that failed, `ScenarioError` where
+    the scenario is to blame.
     """
     vehicle_port, ground_port = free_ports(2)
     common = [scenario, "--lockstep", "--run-dir", str(folder), "--status", "json"]
     if hasattr(os, "sched_getaffinity"):
-        common += ["--cpu", str(max(os.sched_getaffinity(0)))]
+        common += ["--cpu", str(random.choice(sorted(os.sched_getaffinity(0))))]
     for setting in settings:
         common += ["--set", setting]
     vehicle = [
@@ -112,9 +118,9 @@ def _follow(processes: dict[str, subprocess.Popen[bytes]], on_event: OnEvent) ->
                     open_streams -= 1
                     if kind == "out" and processes[end].wait() != 0:
                         _drain(processes[end], errors, end)
-                        raise PairError(
-                            f"{end}: {errors[end].decode(errors='replace').strip() or 'ended without a word'}"
-                        )
+                        said = errors[end].decode(errors="replace").strip() or "the flight did not end as planned"
+                        blame = ScenarioError if processes[end].returncode == EXIT_USAGE else PairError
+                        raise blame(f"{end}: {said}")
                 elif kind == "err":
                     errors[end] += chunk
                 else:

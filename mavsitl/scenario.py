@@ -69,7 +69,10 @@ class Steady(Section, frozen=True, tag_field="model", tag="steady"):
 
 
 class Gust(Section, frozen=True, tag_field="model", tag="gust"):
-    """MIL-F-8785C's 1-cosine gust: 0 before `start_s`, rising over `length_s` to its amplitude, then held or gone."""
+    """MIL-F-8785C's 1-cosine gust: 0 before `start_s`, rising over `length_s` to its amplitude, then held or gone.
+
+    `start_s` is flight time.
+    """
 
     velocity_nwu_m_s: Vector3
     start_s: NonNegative
@@ -168,8 +171,8 @@ class Learning(Section, frozen=True):
 
     rate: tuple[NonNegative, NonNegative, NonNegative] = (10.0, 10.0, 10.0)
     """eta of the P, I and D output weights (eq 31), relative to each weight's initial value."""
-    projection: tuple[Fraction, Annotated[float, msgspec.Meta(ge=1.0)]] | None = (0.5, 1.5)
-    """Output weights stay within these multiples of their initial value. Omit with `guards = false` only."""
+    projection: tuple[Fraction, Annotated[float, msgspec.Meta(ge=1.0)]] = (0.5, 1.5)
+    """Output weights stay within these multiples of their initial value."""
     leakage_per_s: NonNegative = 0.1
     """Pull of each weight towards its initial value."""
     dead_zone_deg: NonNegative = 0.1
@@ -466,13 +469,21 @@ def _check(scenario: Scenario, where: str) -> None:
         raise ScenarioError(
             f"{where}: rates.physics_hz: one step of {rates.physics_hz} Hz is not a whole number of microseconds"
         )
+    if not scenario.start.clamp and not scenario.ground_contact:
+        raise ScenarioError(
+            f"{where}: start.clamp: false is not allowed with ground_contact = false: "
+            "the vehicle would fall from the start"
+        )
     controller = scenario.controller
+    if not controller.learning.leakage_per_s / rates.control_hz < 1.0:
+        raise ScenarioError(
+            f"{where}: controller.learning.leakage_per_s: {controller.learning.leakage_per_s:g} is not allowed; "
+            f"allowed: less than one per control cycle ({rates.control_hz})"
+        )
     if controller.inner == "pidnn" and controller.level != "attitude":
         raise ScenarioError(
             f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'"
         )
-    if controller.learning.guards and controller.learning.projection is None:
-        raise ScenarioError(f"{where}: controller.learning.projection: may be left out only with guards = false")
     steps = scenario.reference.steps if isinstance(scenario.reference, Steps) else ()
     if any(later.time_s <= earlier.time_s for earlier, later in pairwise(steps)):
         raise ScenarioError(f"{where}: reference.steps: time_s must increase from step to step")

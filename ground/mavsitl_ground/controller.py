@@ -70,6 +70,8 @@ class Controller:
             settings.wind_observer.horizontal_rad_s, settings.wind_observer.vertical_rad_s
         )
         self._rate_gain = _rate_gain(flight) if settings.level == "body_rate" else (1.0, 1.0, 1.0)
+        self._whole_attitude = settings.level == "attitude" and settings.inner == "stock"
+        self._yaw_rad = np.zeros(1)
         self._lead_s = _attitude_lag_s(flight) if settings.level == "attitude" else 0.0
         tau = airframe.rotor_time_constant_s
         self._thrust_share = 1.0 - exp(-self._period_s / tau) if tau > 0.0 else 1.0
@@ -125,7 +127,7 @@ class Controller:
         self.wind_acceleration = self._wind(state)
         thrust, phi, theta = self._outer.update(
             state.position_nwu_m, state.velocity_nwu_m_s, state.quaternion,
-            self._position, self._velocity, self._acceleration, state.angles_rad[2], self.wind_acceleration,
+            self._position, self._velocity, self._acceleration, self._yaw(state, yaw), self.wind_acceleration,
         )  # fmt: skip
         self._tilt[0, 0], self._tilt[1, 0] = phi[0], theta[0]
         self._filter.update(self._tilt)
@@ -137,6 +139,14 @@ class Controller:
             self.omega_acceleration = self._inner.update(
                 state.angles_rad, state.angle_rates_rad_s, self._desired, self._desired_rates
             )
+
+    def _yaw(self, state: Observer, reference_rad: float) -> Array:
+        """The yaw at which the tilt is flown: the reference's where all is sent as one attitude, else the measured."""
+        if not self._whole_attitude:
+            measured: Array = state.angles_rad[2]
+            return measured
+        self._yaw_rad[0] = reference_rad
+        return self._yaw_rad
 
     def _wind(self, state: Observer) -> Array:
         """W_1..W_3 of eq 11 by the scenario's source; the model includes the rotors' lag where the airframe has one."""
@@ -180,12 +190,14 @@ def _attitude_lag_s(flight: Flight) -> float:
     """Lag of the attitude loop aboard behind a ramp, s: 1 / MC_ROLL_P for the stock one, none for the PIDNN (eq 28)."""
     if flight.scenario.controller.inner == "pidnn":
         return 0.0
-    gain = (flight.airframe.parameters | flight.scenario.parameters).get("MC_ROLL_P", 0.0)
-    if not gain > 0.0:
+    parameters = flight.airframe.parameters | flight.scenario.parameters
+    roll, pitch = (parameters.get(f"MC_{axis}_P", 0.0) for axis in ("ROLL", "PITCH"))
+    if not roll > 0.0 or roll != pitch:
         raise ScenarioError(
-            f"{flight.name}: parameters.MC_ROLL_P: level 'attitude' needs it in the airframe or scenario"
+            f"{flight.name}: parameters.MC_ROLL_P, MC_PITCH_P: level 'attitude' needs both, equal and above 0, "
+            "in the airframe or the scenario"
         )
-    return 1.0 / gain
+    return 1.0 / roll
 
 
 def _rate_gain(flight: Flight) -> Vector:
@@ -235,7 +247,9 @@ class Ground:
         self._max_thrust_n = flight.airframe.max_thrust_n
         self._released_us: int | None = None
         self._heartbeat_us = -HEARTBEAT_INTERVAL_US
-        self._record = _Record(recorder, flight, with_weights=self._controller.weights is not None)
+        self._record = _Record(
+            recorder, flight, with_weights=self._level != "attitude" and self._controller.weights is not None
+        )
         self._now_us = 0
 
     @property
@@ -273,7 +287,7 @@ class Ground:
             if type(message).id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
                 handshake.on_heartbeat(message, frame.system_id, frame.component_id, self._now_us)
             elif handshake.accepts(frame.system_id, frame.component_id):
-                self._observer.receive(message, self._now_us)
+                self._observer.receive(message)
                 handshake.on_message(message)
                 if type(message).id == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
                     self._report(f"vehicle: {message.text}")
@@ -284,16 +298,17 @@ class Ground:
         self._now_us = now_us
         handshake, state = self._handshake, self._observer
         before = handshake.phase
-        if state.restarted:
+        restarted = state.restarted
+        if restarted:
             handshake.lose("its clock went back, it has restarted", now_us)
         handshake.step(now_us)
-        if handshake.phase is Phase.SEARCH and before is not Phase.SEARCH:
+        if restarted or (handshake.phase is Phase.SEARCH and before is not Phase.SEARCH):
             self._observer.reset()
             self._controller.reset()
             self._released_us = None
         if handshake.phase is Phase.FLY and self._released_us is None:
             self._released_us = state.stamp_us
-        if state.fresh:
+        if state.fresh and state.valid(now_us):
             state.take()
             self._control(now_us)
         if now_us - self._heartbeat_us >= HEARTBEAT_INTERVAL_US and not self.finished:

@@ -17,6 +17,7 @@ from mavsitl.quaternion import euler_rates, normalise, rotate, to_euler
 SPLIT = (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
 ODOMETRY = (mavlink.MAVLINK_MSG_ID_ODOMETRY,)
 Source: TypeAlias = Literal["any", "odometry", "split"]
+NO_OFFSET_US = 1 << 62
 FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
 
 
@@ -51,7 +52,7 @@ class Observer:
         self.restarted = False
         """The vehicle's clock went backwards by more than a second."""
         self._position_us = -1
-        self._received_us = -1
+        self._offset_us = NO_OFFSET_US
         self._fresh = False
         self.true_wind_nwu_m_s = None
 
@@ -64,25 +65,32 @@ class Observer:
         self._fresh = False
 
     def age_us(self, now_us: int) -> int | None:
-        """Since the newest state came, on the ground's clock; None before the first."""
-        return None if self._received_us < 0 else now_us - self._received_us
+        """How old the newest state is at `now_us` of the ground's clock, beyond the fastest transport; None before any.
+
+        The clocks' offset is the least difference seen between coming and stamp: the transport's constant part is not in
+        the age, a drift of the clocks is.
+        """
+        if self.stamp_us < 0:
+            return None
+        self._offset_us = min(self._offset_us, now_us - self.stamp_us)
+        return now_us - self.stamp_us - self._offset_us
 
     def valid(self, now_us: int) -> bool:
         age = self.age_us(now_us)
         return age is not None and age <= self._max_age_us
 
-    def receive(self, message: Any, now_us: int) -> None:
+    def receive(self, message: Any) -> None:
         """A message of the vehicle; others than the four below are ignored, as is one with a non-finite value."""
         kind = type(message).id
         if kind in self._ignored:
             return
         if kind == mavlink.MAVLINK_MSG_ID_ODOMETRY:
-            self._on_odometry(message, now_us)
+            self._on_odometry(message)
         elif kind == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
             q = (message.q1, message.q2, message.q3, message.q4)
             rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
             if _is_attitude(q, rates):
-                self._attitude(q, rates, message.time_boot_ms * 1000, now_us)
+                self._attitude(q, rates, message.time_boot_ms * 1000)
         elif kind == mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
             position, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
             if isfinite(sum(position) + sum(velocity)):
@@ -90,7 +98,7 @@ class Observer:
         elif kind == mavlink.MAVLINK_MSG_ID_DEBUG_VECT and message.name == "WIND_TRUE":
             self.true_wind_nwu_m_s = np.array(flip_vector(message.x, message.y, message.z))[:, np.newaxis]
 
-    def _on_odometry(self, message: Any, now_us: int) -> None:
+    def _on_odometry(self, message: Any) -> None:
         if message.frame_id != mavlink.MAV_FRAME_LOCAL_NED or message.child_frame_id not in FRAMES:
             return
         q = tuple(message.q)
@@ -101,10 +109,10 @@ class Observer:
             return
         if message.child_frame_id == mavlink.MAV_FRAME_BODY_FRD:
             velocity = rotate(normalise(q), velocity)
-        self._attitude(q, rates, message.time_usec, now_us)
+        self._attitude(q, rates, message.time_usec)
         self._position(position, velocity, message.time_usec)
 
-    def _attitude(self, q: Any, rates: Any, stamp_us: int, now_us: int) -> None:
+    def _attitude(self, q: Any, rates: Any, stamp_us: int) -> None:
         if stamp_us < self.stamp_us:
             if self.stamp_us - stamp_us > 1_000_000:
                 self.restarted = True
@@ -115,7 +123,6 @@ class Observer:
         self._angular[:] = (*unit, *angles, *omega, *euler_rates(angles, omega))
         self._fresh = self._fresh or stamp_us > self.stamp_us
         self.stamp_us = stamp_us
-        self._received_us = now_us
 
     def _position(self, position: Any, velocity: Any, stamp_us: int) -> None:
         if stamp_us < self._position_us:

@@ -20,6 +20,10 @@ STREAM_TIME_US = 500_000
 """Setpoints flow this long before OFFBOARD is asked for; PX4 wants to see a stream first."""
 RETRY_US = 1_000_000
 """After a refusal."""
+DISARMED_TIME_US = 500_000
+"""A vehicle disarmed in flight for so long was disarmed by somebody; a restarted one shows its clock before."""
+STOP_TIME_US = 120_000_000
+"""Longest wait for the vehicle to land and disarm."""
 FORCE_DISARM = 21196.0
 
 
@@ -64,9 +68,11 @@ class Handshake:
         self._wanted_system = system_id
         self._report = report
         self._to_ask: list[tuple[int, int]] = []
+        self._asked: int | None = None
         self._phase_us = 0
         self._retry_us = 0
         self._heartbeat_us = -1
+        self._disarmed_us: int | None = None
         self.phase = Phase.SEARCH
         self.target: tuple[int, int] | None = None
         self.armed = False
@@ -129,6 +135,7 @@ class Handshake:
         self.phase = phase
         self._phase_us = now_us
         self._retry_us = 0
+        self._disarmed_us = None
 
     def _search(self, now_us: int) -> None:
         if self.target is not None:
@@ -139,10 +146,16 @@ class Handshake:
     def _connect(self, now_us: int) -> None:
         if self._client.busy:
             return
+        if self._asked is not None and self._client.result != mavlink.MAV_RESULT_ACCEPTED:
+            said = "no answer" if self._client.result is None else f"MAV_RESULT {self._client.result}"
+            self._report(f"the vehicle does not stream message {self._asked} as asked ({said})")
+        self._asked = None
         if self._to_ask:
             message_id, interval_us = self._to_ask.pop(0)
+            self._asked = message_id
             self._client.start(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us, 0, 0, 0, 0, 0)
         else:
+            self._client.result = None
             self._enter(Phase.STREAM, now_us)
 
     def _stream(self, now_us: int) -> None:
@@ -178,7 +191,11 @@ class Handshake:
             self._enter(Phase.FLY, now_us)
 
     def _fly(self, now_us: int) -> None:
-        if not self.armed:
+        if self.armed:
+            self._disarmed_us = None
+        elif self._disarmed_us is None:
+            self._disarmed_us = now_us
+        elif now_us - self._disarmed_us >= DISARMED_TIME_US:
             self._report("the vehicle was disarmed in flight")
             self._enter(Phase.ABORTED, now_us)
 
@@ -186,6 +203,9 @@ class Handshake:
         if not self.armed:
             self._client.cancel()
             self._enter(Phase.DONE, now_us)
+        elif now_us - self._phase_us >= STOP_TIME_US:
+            self._report(f"the vehicle did not disarm within {STOP_TIME_US / 1e6:g} s")
+            self._enter(Phase.ABORTED, now_us)
         elif self._land:
             if self.offboard:
                 self._ask("landing", now_us, mavlink.MAV_CMD_NAV_LAND, nan, nan, nan, nan, nan, nan, nan)

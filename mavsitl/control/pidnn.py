@@ -342,15 +342,13 @@ class Pidnn:
         limit_rad_s2: Vector3 = UNLIMITED,
         n: int = 1,
     ) -> None:
-        """Raises `ValueError` for a period not > 0, guards without a projection, a leakage of 1 or more per period."""
+        """Raises `ValueError` for a period not > 0, or a leakage of 1 or more per period."""
         self._period = _check_period(period_s)
-        if learning.guards and learning.projection is None:
-            raise ValueError("learning.projection: may be left out only with guards = false")
         if learning.guards and not learning.leakage_per_s * period_s < 1.0:
             raise ValueError(
                 f"learning.leakage_per_s: {learning.leakage_per_s} is not below {1.0 / period_s} (one per period)"
             )
-        low, high = learning.projection or (1.0, 1.0)
+        low, high = learning.projection
         self._by_rate = derivative == "rate"
         self._learn_inputs = learning.input_weights == "learned"
         self._known_sign = learning.delta == "known"

@@ -117,6 +117,8 @@ class FlightData:
         wind = held(vehicle, topics.WIND_TRUTH, "windspeed_north", "windspeed_east", "windspeed_down")
         link = held(ground, topics.LINK_STATUS, "received", "lost", "bad", "state_age_us")
         weights = held(ground, topics.PIDNN_WEIGHTS, "roll", "pitch", "yaw")
+        if weights is None:
+            weights = held(vehicle, topics.PIDNN_WEIGHTS, "roll", "pitch", "yaw")
         saturated = held(vehicle, topics.ROTOR_STATUS, "saturated")
         return cls(
             time_s=(stamps - np.uint64(release_us)).astype(np.float64) * 1e-6,

@@ -119,6 +119,10 @@ VEHICLE_STATUS = Topic("vehicle_status", ("uint8_t arming_state", "uint8_t nav_s
 LAND_DETECTED = Topic("vehicle_land_detected", ("uint8_t landed", "uint8_t ground_contact"))
 """Written at every change; the first row with landed = 0 is the release."""
 
+# Whichever end the nets are seated in
+PIDNN_WEIGHTS = Topic("pidnn_weights", ("float[3] roll", "float[3] pitch", "float[3] yaw"))
+"""Output weights P, I, D."""
+
 # Ground
 TRAJECTORY_SETPOINT = Topic("trajectory_setpoint", ("float[3] position", "float[3] velocity", "float yaw"))
 ATTITUDE_SETPOINT = Topic(
@@ -127,8 +131,6 @@ ATTITUDE_SETPOINT = Topic(
 """The commanded angles, rad: what the attitude RMSE is taken against. thrust_body is FRD: (0, 0, -thrust)."""
 CONTROL_DEMAND = Topic("control_demand", ("float[4] u", "float[3] wind_acceleration"))
 """U_1..U_4 (eq 12) in N, N, N, N m and W_1..W_3 in m/s^2, NWU."""
-PIDNN_WEIGHTS = Topic("pidnn_weights", ("float[3] roll", "float[3] pitch", "float[3] yaw"))
-"""Output weights P, I, D."""
 LINK_STATUS = Topic("link_status", ("uint32_t received", "uint32_t lost", "uint32_t bad", "uint32_t state_age_us"))
 """Counts since the start: frames received, lost by sequence number, and refused; age of the state used, us."""
 
@@ -145,6 +147,7 @@ VEHICLE_TOPICS = (
     RATES_SETPOINT,
     VEHICLE_STATUS,
     LAND_DETECTED,
+    PIDNN_WEIGHTS,
 )
 GROUND_TOPICS = (TRAJECTORY_SETPOINT, ATTITUDE_SETPOINT, CONTROL_DEMAND, PIDNN_WEIGHTS, LINK_STATUS)
-TOPICS = VEHICLE_TOPICS + GROUND_TOPICS
+TOPICS = tuple(dict.fromkeys(VEHICLE_TOPICS + GROUND_TOPICS))

@@ -63,7 +63,9 @@ def record(flight: Flight, *, folder: str, wire_hash: str, real_time_factor: flo
         seed=scenario.seed,
         airframe=scenario.airframe,
         level=scenario.controller.level,
-        law=scenario.controller.law,
+        law="stock"
+        if scenario.controller.level == "attitude" and scenario.controller.inner == "stock"
+        else scenario.controller.law,
         wind_information=scenario.controller.wind_information,
         wire_hash=wire_hash,
         real_time_factor=real_time_factor,

@@ -114,7 +114,7 @@ def test_roll_step(client: Client, side: float) -> None:
 def test_yaw_rate_feeds_forward(client: Client) -> None:
     """Attitude with a body yaw rate that is not ignored: the nose goes right, ahead of the attitude asked for."""
     client.climb(3.0)
-    client.run(0.3, lambda: client.send(attitude_target(3, rates=(9.0, 9.0, 0.3))))
+    client.run(0.1, lambda: client.send(attitude_target(3, rates=(9.0, 9.0, 0.3))))
     state = client.last("ATTITUDE", 0)
     assert state.yawspeed > 0.1
     assert abs(state.rollspeed) < 0.02

@@ -424,8 +424,6 @@ def test_reset_of_one_vehicle_leaves_the_others() -> None:
 
 
 def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(ValueError, match="projection"):
-        build(Learning(projection=None))
     with pytest.raises(ValueError, match="leakage"):
         build(Learning(leakage_per_s=250.0))
     with pytest.raises(ValueError, match="period"):

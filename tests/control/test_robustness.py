@@ -12,7 +12,7 @@ from tests.control.linear_loop import Shares, closed_loop, held_plant, unstable
 CONTROLLER = Controller()
 GAINS = CONTROLLER.roll_pitch
 T_S = 0.004
-PROJECTION = CONTROLLER.learning.projection or (1.0, 1.0)
+PROJECTION = CONTROLLER.learning.projection
 GRID = np.linspace(PROJECTION[0], PROJECTION[1], 11)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from mavsitl import pair, scenario
+from mavsitl.scenario import ScenarioError
 from tests.drivers.exercise import hash_in_memory, shortened
 
 
@@ -40,5 +41,5 @@ def test_without_wind_and_noise_the_seed_is_nothing() -> None:
 
 @pytest.mark.sockets
 def test_a_failing_end_is_named_with_its_own_words(tmp_path: Path) -> None:
-    with pytest.raises(pair.PairError, match=r"(vehicle|ground): mavsitl \w+: hover-calm \(shipped\): seed: -1"):
+    with pytest.raises(ScenarioError, match=r"(vehicle|ground): mavsitl \w+: hover-calm \(shipped\): seed: -1"):
         pair.fly("hover-calm", ["seed=-1"], tmp_path, lambda end, event: None)

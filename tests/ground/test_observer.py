@@ -67,7 +67,7 @@ EXPECTED = [*POSITION, *VELOCITY, *QUATERNION, *ANGLES, *OMEGA]
 @pytest.mark.parametrize("child", [mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD])
 def test_odometry_in_either_child_frame(child: int) -> None:
     observer = Observer()
-    observer.receive(odometry(8000, child=child), 0)
+    observer.receive(odometry(8000, child=child))
     assert state(observer) == pytest.approx(EXPECTED, abs=1e-12)
     assert observer.stamp_us == 8000
     assert observer.fresh
@@ -77,9 +77,9 @@ def test_odometry_in_either_child_frame(child: int) -> None:
 def test_split_telemetry_is_the_same_state(attitude_first: bool) -> None:
     observer = Observer()
     first, second = (attitude, position) if attitude_first else (position, attitude)
-    observer.receive(first(8000), 0)
+    observer.receive(first(8000))
     assert not observer.fresh
-    observer.receive(second(8000), 0)
+    observer.receive(second(8000))
     assert observer.fresh
     assert observer.stamp_us == 8000
     assert state(observer) == pytest.approx(EXPECTED, abs=1e-12)
@@ -87,8 +87,8 @@ def test_split_telemetry_is_the_same_state(attitude_first: bool) -> None:
 
 def test_odometry_in_other_frames_is_ignored() -> None:
     observer = Observer()
-    observer.receive(odometry(8000, child=mavlink.MAV_FRAME_GLOBAL), 0)
-    observer.receive(odometry(8000, frame_id=mavlink.MAV_FRAME_LOCAL_FLU), 0)
+    observer.receive(odometry(8000, child=mavlink.MAV_FRAME_GLOBAL))
+    observer.receive(odometry(8000, frame_id=mavlink.MAV_FRAME_LOCAL_FLU))
     assert observer.stamp_us == -1
     assert not observer.fresh
 
@@ -111,10 +111,10 @@ BAD: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("bad", BAD.values(), ids=BAD.keys())
 def test_nothing_of_a_bad_message_is_taken(bad: dict[str, Any], child: int) -> None:
     observer = Observer()
-    observer.receive(odometry(4000), 0)
+    observer.receive(odometry(4000))
     observer.take()
     before = state(observer)
-    observer.receive(odometry(8000, child=child, **({"x": 9.0, "vx": 9.0, "rollspeed": 9.0} | bad)), 4000)
+    observer.receive(odometry(8000, child=child, **({"x": 9.0, "vx": 9.0, "rollspeed": 9.0} | bad)))
     assert state(observer) == before
     assert observer.stamp_us == 4000
     assert not observer.fresh
@@ -123,59 +123,59 @@ def test_nothing_of_a_bad_message_is_taken(bad: dict[str, Any], child: int) -> N
 @pytest.mark.parametrize("field", range(1, 8))
 def test_split_messages_that_are_not_finite_are_ignored(field: int) -> None:
     observer = Observer()
-    observer.receive(attitude(4000), 0)
-    observer.receive(position(4000), 0)
+    observer.receive(attitude(4000))
+    observer.receive(position(4000))
     before = state(observer)
     values: list[Any] = [8, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     values[field] = nan
-    observer.receive(mavlink.MAVLink_attitude_quaternion_message(*values), 0)
+    observer.receive(mavlink.MAVLink_attitude_quaternion_message(*values))
     if field < 7:
-        observer.receive(mavlink.MAVLink_local_position_ned_message(*values[:7]), 0)
+        observer.receive(mavlink.MAVLink_local_position_ned_message(*values[:7]))
     assert state(observer) == before
     assert observer.stamp_us == 4000
 
 
 def test_a_late_message_does_not_overwrite_a_newer_one() -> None:
     observer = Observer()
-    observer.receive(odometry(900_000), 0)
+    observer.receive(odometry(900_000))
     observer.take()
     before = state(observer)
-    observer.receive(odometry(896_000, x=50.0, vx=50.0, rollspeed=1.0), 0)
+    observer.receive(odometry(896_000, x=50.0, vx=50.0, rollspeed=1.0))
     assert state(observer) == before
     assert (observer.stamp_us, observer.fresh, observer.restarted) == (900_000, False, False)
 
 
 def test_the_same_stamp_again_is_not_fresh() -> None:
     observer = Observer()
-    observer.receive(odometry(4000), 0)
+    observer.receive(odometry(4000))
     observer.take()
-    observer.receive(odometry(4000), 0)
+    observer.receive(odometry(4000))
     assert not observer.fresh
 
 
 @pytest.mark.parametrize("send", [odometry, attitude])
 def test_a_clock_that_goes_back_by_more_than_a_second_is_a_restart(send: Any) -> None:
     observer = Observer()
-    observer.receive(odometry(5_000_000), 0)
-    observer.receive(position(5_000_000), 0)
-    observer.receive(send(4_000_000), 0)
+    observer.receive(odometry(5_000_000))
+    observer.receive(position(5_000_000))
+    observer.receive(send(4_000_000))
     assert not observer.restarted
-    observer.receive(send(3_999_000), 0)
+    observer.receive(send(3_999_000))
     assert observer.restarted
     observer.reset()
     assert not observer.restarted
-    observer.receive(odometry(0), 0)
+    observer.receive(odometry(0))
     assert observer.stamp_us == 0
     assert observer.fresh
 
 
 def test_an_attitude_without_a_position_near_it_is_not_fresh() -> None:
     observer = Observer(max_age_us=500_000)
-    observer.receive(position(100_000), 0)
-    observer.receive(attitude(600_000), 0)
+    observer.receive(position(100_000))
+    observer.receive(attitude(600_000))
     assert observer.fresh
     observer.take()
-    observer.receive(attitude(601_000), 0)
+    observer.receive(attitude(601_000))
     assert not observer.fresh
 
 
@@ -183,21 +183,24 @@ def test_age_and_validity_are_by_the_ground_s_clock() -> None:
     observer = Observer(max_age_us=500_000)
     assert observer.age_us(7_000_000) is None
     assert not observer.valid(7_000_000)
-    observer.receive(odometry(4000), 7_000_000)
+    observer.receive(odometry(4000))
+    assert observer.age_us(7_000_000) == 0  # the fastest way seen so far
     assert observer.age_us(7_500_000) == 500_000
     assert observer.valid(7_500_000)
     assert not observer.valid(7_500_001)
+    observer.receive(odometry(504_000))
+    assert observer.age_us(7_500_300) == 300
     observer.reset()
     assert observer.age_us(7_500_000) is None
 
 
 def test_true_wind_is_turned_and_forgotten() -> None:
     observer = Observer()
-    observer.receive(mavlink.MAVLink_debug_vect_message(b"OTHER", 0, 9.0, 9.0, 9.0), 0)
+    observer.receive(mavlink.MAVLink_debug_vect_message(b"OTHER", 0, 9.0, 9.0, 9.0))
     assert observer.true_wind_nwu_m_s is None
     message = mavlink.MAVLink_debug_vect_message(b"WIND_TRUE", 0, 1.0, 2.0, 3.0)
     message.name = "WIND_TRUE"  # as a decoded message has it
-    observer.receive(message, 0)
+    observer.receive(message)
     wind = observer.true_wind_nwu_m_s
     assert wind is not None
     np.testing.assert_array_equal(wind, [[1.0], [-2.0], [-3.0]])

@@ -18,8 +18,6 @@ from mavsitl_vehicle.wind.field import WindField
 BLOCK_TICKS = 250
 """Normals are drawn for this many ticks at once."""
 
-SATURATED_MASK = 0xFF
-
 
 class Simulation:
     """Arrays have the fleet axis last: `x` (17, n) the truth, `estimate` (13, n) what sensors say, `wind` (3, n)."""
@@ -79,8 +77,11 @@ class Simulation:
         """At rest at the start pose, rotors still; time, wind and sensors go on."""
         self.x[:] = self._start
 
-    def advance(self) -> None:
-        """One control period: the inner loops and the physics at the physics rate, then the sensors."""
+    def advance(self, flight_time_s: float) -> None:
+        """One control period: the inner loops and the physics at the physics rate, then the sensors.
+
+        `flight_time_s`: since the release, negative before it; gusts go by it.
+        """
         row = self._tick % BLOCK_TICKS
         if row == 0 and self._tick:
             self._draw()
@@ -88,7 +89,7 @@ class Simulation:
         tick.advance(
             self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._command,
             field.state, field.coefficients, self.wind, self._wind_block[row], self._sensor_block[row],
-            self.sigma, self._tick * self.substeps * self.dt_s, self.dt_s, self.substeps,
+            self.sigma, flight_time_s, self.dt_s, self.substeps,
         )  # fmt: skip
         self._tick += 1
 

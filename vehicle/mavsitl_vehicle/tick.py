@@ -104,6 +104,9 @@ def inner_loops(
             continue
         torque = (0.0, 0.0, 0.0)
         if kind == TORQUE_KIND:
+            for i in range(3):
+                inner[RATE_INTEGRAL + i, j] = 0.0
+                inner[LAST_GYRO + i, j] = x[10 + i, j]
             torque = (
                 demand[TORQUE, j] * gains[MAX_TORQUE],
                 demand[TORQUE + 1, j] * gains[MAX_TORQUE + 1],

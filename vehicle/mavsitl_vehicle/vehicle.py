@@ -44,8 +44,8 @@ class Vehicle:
         self.simulation = Simulation(flight, self.autopilot.parameters, seed)
         self._flight = flight
         self._recorder = recorder
-        self._record = _Record(recorder, flight)
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
+        self._record = _Record(recorder, flight, aboard=self._seated is not None)
         self._now_us = -self.period_us
         self._done = False
         if lockstep:
@@ -57,6 +57,11 @@ class Vehicle:
     def token_us(self) -> int:
         """The stamp that the newest off-board setpoint echoes; lock-step advances when it is the tick's own."""
         return self.autopilot.token_us
+
+    @property
+    def weights(self) -> Array | None:
+        """Output weights (3 outputs P I D, 3 axes, 1) of the PIDNN aboard; None where none is seated."""
+        return None if self._seated is None else self._seated.weights
 
     @property
     def finished(self) -> bool:
@@ -92,7 +97,9 @@ class Vehicle:
             simulation.held[0] = autopilot.held
             setpoint = autopilot.decide(now_us - self.period_us)
             simulation.set_demand(0, self._inner_law(setpoint))
-            simulation.advance()
+            released_us = autopilot.released_us
+            flown_s = -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
+            simulation.advance(flown_s)
         estimate = simulation.estimate[:, 0].tolist()
         autopilot.estimate = estimate
         wind = simulation.wind[:, 0].tolist()
@@ -149,7 +156,8 @@ _WIDTH = 38
 class _Record:
     """The vehicle's log: truth beside estimate every tick, states when they change."""
 
-    def __init__(self, recorder: Recorder, flight: Flight) -> None:
+    def __init__(self, recorder: Recorder, flight: Flight, aboard: bool) -> None:
+        """`aboard`: the nets are, so their weights are logged here."""
         largest = flight.airframe.max_rotor_speed_rad_s
         self._block = Block(
             recorder,
@@ -167,6 +175,7 @@ class _Record:
                 (topics.RATES_SETPOINT, lambda v: np.column_stack((ned(v[:, 33:36]), _thrust_frd(v[:, _THRUST])))),
             ),
         )
+        self._weights = recorder.topic(topics.PIDNN_WEIGHTS) if aboard else None
         self._status = recorder.topic(topics.VEHICLE_STATUS)
         self._land = recorder.topic(topics.LAND_DETECTED)
         self._last_status: tuple[int, int, int] | None = None
@@ -180,6 +189,8 @@ class _Record:
         row[_WIND] = simulation.wind[:, 0]
         row[_INNER] = simulation.inner[tick.RATE_SETPOINT : tick.SATURATED + 1, 0]
         row[_THRUST] = simulation.demand[tick.THRUST, 0]
+        if self._weights is not None and vehicle.weights is not None:
+            self._weights.append(now_us, *vehicle.weights[:, :, 0].T.ravel().tolist())
         commander = autopilot.commander
         status = (2 if commander.armed else 1, modes.TABLE[commander.mode].nav_state, int(commander.failsafe))
         if status != self._last_status:

@@ -29,6 +29,7 @@ LANDED_HEIGHT_M = 0.05
 LANDED_SPEED_M_S = 0.15
 AIRBORNE_HEIGHT_M = 0.15
 LANDING_TIME_US = 300_000
+LANDING_FILTER_S = 0.3
 
 REFUSAL_TEXT_INTERVAL_US = 1_000_000
 """At most one STATUSTEXT on refused setpoints in this time: a bad stream must not flood its own link."""
@@ -77,6 +78,9 @@ class Autopilot:
         self._refusal_text_us = -REFUSAL_TEXT_INTERVAL_US
         self._shown: tuple[Mode, bool, bool, int] | None = None
         self._still_since_us: int | None = None
+        self._smooth = (0.0, 0.0, 0.0, 0.0)
+        """Height and velocity for the landing detector, with the sensors' noise filtered out."""
+        self._smoothing = min(period_s / LANDING_FILTER_S, 1.0)
         self._commands = CommandServer(self._execute)
         self._handlers: dict[int, Callable[[Any, int, int], None]] = {
             mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: self._on_attitude_target,
@@ -240,6 +244,14 @@ class Autopilot:
     def observe(self, now_us: int) -> None:
         """After the physics, with the new estimate: is it on the ground, in the clamp, taking off, in the air?"""
         commander = self.commander
+        share, e = self._smoothing, self.estimate
+        z, vx, vy, vz = self._smooth
+        self._smooth = (
+            z + share * (e[2] - z),
+            vx + share * (e[3] - vx),
+            vy + share * (e[4] - vy),
+            vz + share * (e[5] - vz),
+        )
         if not commander.armed:
             if self.landed_state != mavlink.MAV_LANDED_STATE_ON_GROUND and not self.held:
                 self._update_landed(now_us)
@@ -256,12 +268,12 @@ class Autopilot:
             self._update_landed(now_us)
 
     def _update_landed(self, now_us: int) -> None:
-        e = self.estimate
-        if e[2] > AIRBORNE_HEIGHT_M:
+        z, vx, vy, vz = self._smooth
+        if z > AIRBORNE_HEIGHT_M:
             self.landed_state = mavlink.MAV_LANDED_STATE_IN_AIR
             self._still_since_us = None
             return
-        still = e[2] < LANDED_HEIGHT_M and abs(e[5]) < LANDED_SPEED_M_S and hypot(e[3], e[4]) < LANDED_SPEED_M_S
+        still = z < LANDED_HEIGHT_M and abs(vz) < LANDED_SPEED_M_S and hypot(vx, vy) < LANDED_SPEED_M_S
         landing = self.commander.mode is Mode.LAND or not self.commander.armed
         if not (still and landing):
             self._still_since_us = None

@@ -33,6 +33,11 @@ class SeatedLaw:
         )  # compiles, or reads the cache, before the clock runs
         self.reset()
 
+    @property
+    def weights(self) -> NDArray[np.float64] | None:
+        """Output weights (3 outputs P I D, 3 axes, 1) of a PIDNN; None for the PID."""
+        return self._law.weights
+
     def reset(self) -> None:
         """Back to the identical PID, at rest."""
         self._law.reset()
