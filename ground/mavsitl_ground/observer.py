@@ -67,8 +67,8 @@ class Observer:
     def age_us(self, now_us: int) -> int | None:
         """How old the newest state is at `now_us` of the ground's clock, beyond the fastest transport; None before any.
 
-        The clocks' offset is the least difference seen between coming and stamp: the transport's constant part is not in
-        the age, a drift of the clocks is.
+        The clocks' offset is the least difference seen between coming and stamp: the transport's constant part is not
+        in the age, a drift of the clocks is.
         """
         if self.stamp_us < 0:
             return None
