@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from mavsitl.ends import NullRecorder
 from mavsitl_ground.controller import Ground
 from mavsitl_vehicle.vehicle import Vehicle
+
+from mavsitl.ends import NullRecorder
 from tests.drivers.exercise import shortened
 
 
