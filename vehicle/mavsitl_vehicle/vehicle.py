@@ -144,6 +144,9 @@ _STATE_MESSAGES = {
 }
 
 
+# vehicle_status.arming_state
+DISARMED, ARMED = 1, 2
+
 # Columns of the vehicle's log block.
 _TRUTH = slice(0, 17)
 _ESTIMATE = slice(17, 30)
@@ -178,7 +181,7 @@ class _Record:
         self._weights = recorder.topic(topics.PIDNN_WEIGHTS) if aboard else None
         self._status = recorder.topic(topics.VEHICLE_STATUS)
         self._land = recorder.topic(topics.LAND_DETECTED)
-        self._last_status: tuple[int, int, int] | None = None
+        self._last_status: tuple[bool, Mode, bool] | None = None
         self._last_land: int | None = None
 
     def write(self, now_us: int, vehicle: Vehicle) -> None:
@@ -192,10 +195,11 @@ class _Record:
         if self._weights is not None and vehicle.weights is not None:
             self._weights.append(now_us, *vehicle.weights[:, :, 0].T.ravel().tolist())
         commander = autopilot.commander
-        status = (2 if commander.armed else 1, modes.TABLE[commander.mode].nav_state, int(commander.failsafe))
+        status = (commander.armed, commander.mode, commander.failsafe)
         if status != self._last_status:
             self._last_status = status
-            self._status.append(now_us, *status)
+            nav_state = modes.TABLE[commander.mode].nav_state
+            self._status.append(now_us, ARMED if commander.armed else DISARMED, nav_state, int(commander.failsafe))
         landed = int(autopilot.released_us is None or autopilot.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND)
         if landed != self._last_land:
             self._last_land = landed
