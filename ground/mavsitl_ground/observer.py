@@ -120,14 +120,14 @@ class Observer:
         unit = normalise(flip_quaternion(*q))
         angles = to_euler(unit)
         omega = flip_vector(*rates)
-        self._angular[:] = (*unit, *angles, *omega, *euler_rates(angles, omega))
+        self._angular[:] = unit + angles + omega + euler_rates(angles, omega)
         self._fresh = self._fresh or stamp_us > self.stamp_us
         self.stamp_us = stamp_us
 
     def _position(self, position: Any, velocity: Any, stamp_us: int) -> None:
         if stamp_us < self._position_us:
             return
-        self._linear[:] = (*flip_vector(*position), *flip_vector(*velocity))
+        self._linear[:] = flip_vector(*position) + flip_vector(*velocity)
         self._position_us = stamp_us
 
 

@@ -17,6 +17,7 @@ _MAVLINK_1 = 0xFE
 _MAVLINK_2 = 0xFD
 _SIGNED = 0x01
 _HASH_CHUNK_BYTES = 16_384
+_BUFFER_BYTES = 65_536
 
 
 class Direction(IntEnum):
@@ -56,6 +57,7 @@ class TlogWriter:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._waiting = bytearray()
         self.left_out_bytes = 0
         """Bytes of datagrams that belonged to no frame and so are not in the file."""
         try:
@@ -65,26 +67,39 @@ class TlogWriter:
 
     def write(self, timestamp_us: int, datagram: bytes) -> None:
         """Append the frames of one datagram, sent by either side at `timestamp_us`."""
-        stamp = _STAMP.pack(timestamp_us)
+        waiting = self._waiting
         if len(datagram) > 2 and datagram[0] == _MAVLINK_2 and not datagram[2] and len(datagram) == 12 + datagram[1]:
-            split = [datagram]  # one frame, as nearly always
+            waiting += _STAMP.pack(timestamp_us)  # one frame, as nearly always
+            waiting += datagram
         else:
-            split = frames(datagram)
-        self.left_out_bytes += len(datagram) - sum(map(len, split))
-        try:
-            self._file.write(b"".join(part for frame in split for part in (stamp, frame)))
-        except OSError as error:
-            raise self._error(error) from error
+            taken = 0
+            for frame in frames(datagram):
+                waiting += _STAMP.pack(timestamp_us)
+                waiting += frame
+                taken += len(frame)
+            self.left_out_bytes += len(datagram) - taken
+        if len(waiting) > _BUFFER_BYTES:
+            self.flush()
 
     def flush(self) -> None:
         """Hand everything written so far to the system."""
+        waiting, self._waiting = self._waiting, bytearray()
         try:
+            self._file.write(waiting)
             self._file.flush()
         except OSError as error:
             raise self._error(error) from error
 
     def close(self) -> None:
         """More than once is harmless."""
+        if self._file.closed:
+            return
+        try:
+            self.flush()
+        finally:
+            self._shut()
+
+    def _shut(self) -> None:
         try:
             self._file.close()
         except OSError as error:
