@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 PAPER_SCENARIOS = ("hover-calm", "hover-wind", "spiral-calm", "spiral-wind")
 
+DEADLINE_S = 10.0
+SLOWEST_SPEED = 0.5
+"""Clients miss a HEARTBEAT after 3 s of wall clock."""
+
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 DESCRIPTION = """\
@@ -84,6 +88,10 @@ examples:
 """
 
 
+class UsageError(ValueError):
+    """Arguments that do not go together."""
+
+
 class _Formatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=32, width=110)
@@ -107,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         return run(options)
-    except (ScenarioError, AddressError, WingError) as error:
+    except (UsageError, ScenarioError, AddressError, WingError) as error:
         print(f"mavsitl {options.command}: {error}", file=sys.stderr)
         return EXIT_USAGE
     except (LinkError, LogError, PairError, RunError) as error:
@@ -160,6 +168,13 @@ def _above_zero(text: str) -> float:
         value = math.nan
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: a finite number above 0")
+    return value
+
+
+def _speed(text: str) -> float:
+    value = _above_zero(text)
+    if value < SLOWEST_SPEED:
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: {SLOWEST_SPEED:g} or more")
     return value
 
 
@@ -235,9 +250,13 @@ def _add_vehicle(commands: Any) -> None:
     group.add_argument("--gcs-remote", metavar="HOST:PORT", help="where it sends first (default: 127.0.0.1:14550)")
     _add_end_options(parser)
     parser.add_argument(
-        "--speed", type=_above_zero, default=1.0, metavar="X", help="simulated over wall time (default: 1)"
+        "--speed",
+        type=_speed,
+        metavar="X",
+        help=f"simulated over wall time, {SLOWEST_SPEED:g} or more: slower, the 1 Hz HEARTBEAT "
+        "would count as lost (default: 1)",
     )
-    parser.add_argument("--until-disarmed", action="store_true", help="end after the first flight")
+    parser.add_argument("--until-disarmed", action="store_true", default=None, help="end after the first flight")
     parser.set_defaults(run=_vehicle)
 
 
@@ -267,7 +286,6 @@ def _add_ground(commands: Any) -> None:
     group.add_argument(
         "--vehicle",
         metavar="HOST:PORT",
-        default="127.0.0.1:14580",
         help="lock-step only: the vehicle's off-board port (default: 127.0.0.1:14580)",
     )
     _add_end_options(parser)
@@ -282,7 +300,6 @@ def _add_end_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--deadline",
         type=_above_zero,
-        default=10.0,
         metavar="S",
         help="lock-step: a partner silent for so long is an error (default: 10)",
     )
@@ -530,6 +547,16 @@ class _Status:
         sys.stdout.flush()
 
 
+def _check_lockstep(
+    options: argparse.Namespace, *, real_time_only: Sequence[str], lockstep_only: Sequence[str]
+) -> None:
+    """An option that would have no effect is refused, not ignored."""
+    names, needed = (real_time_only, "not with") if options.lockstep else (lockstep_only, "only with")
+    for name in names:
+        if getattr(options, name[2:].replace("-", "_")) is not None:
+            raise UsageError(f"{name}: {needed} --lockstep")
+
+
 def _vehicle(options: argparse.Namespace) -> int:
     from mavsitl import ends
 
@@ -544,6 +571,10 @@ def _vehicle(options: argparse.Namespace) -> int:
         gcs_port=options.gcs_port if options.gcs_port is not None else ends.GCS_PORT + instance,
         gcs_remote=_endpoint(options.gcs_remote or f"127.0.0.1:{ends.GCS_REMOTE_PORT}", "--gcs-remote"),
     )
+    _check_lockstep(
+        options, real_time_only=("--speed", "--until-disarmed", "--gcs-port", "--gcs-remote"),
+        lockstep_only=("--deadline", "--cpu"),
+    )  # fmt: skip
     status = _Status(options.status == "json")
     if options.lockstep:
         outcome = ends.vehicle_lockstep(
@@ -552,7 +583,7 @@ def _vehicle(options: argparse.Namespace) -> int:
             options.run_dir,
             system_id=system_id,
             wing=options.wing,
-            deadline_s=options.deadline,
+            deadline_s=options.deadline or DEADLINE_S,
             cpu=options.cpu,
             progress=status.progress,
         )
@@ -563,8 +594,8 @@ def _vehicle(options: argparse.Namespace) -> int:
             "Ctrl-C ends it"
         )
         outcome = ends.vehicle_realtime(
-            flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed,
-            until_finished=options.until_disarmed, stop=status.stop, progress=None,
+            flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
+            until_finished=bool(options.until_disarmed), stop=status.stop, progress=None,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK
@@ -576,12 +607,14 @@ def _ground(options: argparse.Namespace) -> int:
 
     flight = _load(options.scenario, _settings(options))
     address = parse_address(options.link)
+    _check_lockstep(options, real_time_only=(), lockstep_only=("--deadline", "--cpu", "--vehicle"))
     status = _Status(options.status == "json")
     if options.lockstep:
-        remote = _endpoint(options.vehicle, "--vehicle")
+        remote = _endpoint(options.vehicle or f"127.0.0.1:{ends.OFFBOARD_PORT}", "--vehicle")
         outcome = ends.ground_lockstep(
             flight, (address.host, address.port), remote, options.run_dir,
-            wing=options.wing, deadline_s=options.deadline, cpu=options.cpu,
+            vehicle_system_id=options.system, wing=options.wing,
+            deadline_s=options.deadline or DEADLINE_S, cpu=options.cpu,
             report=status.say, progress=status.progress,
         )  # fmt: skip
     else:

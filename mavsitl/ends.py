@@ -146,7 +146,8 @@ def vehicle_lockstep(
 
 def ground_lockstep(
     flight: Flight, bind: tuple[str, int], remote: tuple[str, int], folder: Path | None, *,
-    wing: str | None, deadline_s: float, cpu: int | None, report: Callable[[str], None], progress: Progress | None,
+    vehicle_system_id: int | None, wing: str | None, deadline_s: float, cpu: int | None,
+    report: Callable[[str], None], progress: Progress | None,
 ) -> Outcome:  # fmt: skip
     """The ground in lock-step over UDP with one vehicle. Raises as `vehicle_lockstep`."""
     link = ConnectedUdp(
@@ -158,7 +159,8 @@ def ground_lockstep(
     )
     try:
         with _logs(folder, GROUND_END, flight) as (recorder, tap):
-            core = wings.find(wings.GROUND_GROUP, wing)(flight, recorder, report=report)
+            build = wings.find(wings.GROUND_GROUP, wing)
+            core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
             end_us = drivers.run_lockstep_ground(core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress)
             return watch.outcome(end_us, tap)

@@ -238,10 +238,17 @@ class Ground:
         self._report = report
         messages = [(message_id, self.period_us) for message_id in STATE_MESSAGES[scenario.controller.telemetry]]
         messages.append((mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, SYS_STATE_INTERVAL_US))
+        required: frozenset[int] = frozenset()
         if scenario.controller.wind_information == "oracle":
             messages.append((mavlink.MAVLINK_MSG_ID_DEBUG_VECT, self.period_us))
+            required = frozenset((mavlink.MAVLINK_MSG_ID_DEBUG_VECT,))  # without it the oracle would know nothing
         self._handshake = Handshake(
-            self._send_command, messages, land=scenario.ground_contact, system_id=vehicle_system_id, report=report
+            self._send_command,
+            messages,
+            land=scenario.ground_contact,
+            required=required,
+            system_id=vehicle_system_id,
+            report=report,
         )
         self._hover_thrust = 1.0 / flight.airframe.thrust_to_weight
         self._max_thrust_n = flight.airframe.max_thrust_n

@@ -52,14 +52,20 @@ class Observer:
         self.restarted = False
         """The vehicle's clock went backwards by more than a second."""
         self._position_us = -1
+        self._pairs = 0
+        """Attitudes in a row that had a position of their own stamp; after two the next is waited for too."""
         self._offset_us = NO_OFFSET_US
         self._fresh = False
         self.true_wind_nwu_m_s = None
 
     @property
     def fresh(self) -> bool:
-        """A new attitude since the last `take`, and a position and velocity that go with it."""
-        return self._fresh and self._position_us >= 0 and self.stamp_us - self._position_us <= self._max_age_us
+        """A new attitude since the last `take`, and a position and velocity that go with it.
+
+        Where both streams are equally fast, an attitude whose position is still on its way is not fresh yet.
+        """
+        gap_us = self.stamp_us - self._position_us
+        return self._fresh and self._position_us >= 0 and gap_us <= (0 if self._pairs >= 2 else self._max_age_us)
 
     def take(self) -> None:
         self._fresh = False
@@ -117,6 +123,8 @@ class Observer:
             if self.stamp_us - stamp_us > 1_000_000:
                 self.restarted = True
             return
+        if stamp_us > self.stamp_us:
+            self._pairs = self._pairs + 1 if 0 <= self.stamp_us == self._position_us else 0
         unit = normalise(flip_quaternion(*q))
         angles = to_euler(unit)
         omega = flip_vector(*rates)

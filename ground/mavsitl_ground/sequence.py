@@ -55,16 +55,19 @@ class Handshake:
         intervals: Sequence[tuple[int, int]],
         *,
         land: bool,
+        required: frozenset[int] = frozenset(),
         system_id: int | None = None,
         report: Callable[[str], None],
     ) -> None:
         """`intervals`: (message id, us) to request on connection. `land`: end by landing, else by a forced disarm.
 
+        `required`: ids of `intervals` without which there is no flight: a refusal of one ends it before it began.
         `system_id`: fly only that vehicle; None: the first autopilot heard.
         """
         self._client = CommandClient(send_command)
         self._intervals = intervals
         self._land = land
+        self._required = required
         self._wanted_system = system_id
         self._report = report
         self._to_ask: list[tuple[int, int]] = []
@@ -149,6 +152,10 @@ class Handshake:
         if self._asked is not None and self._client.result != mavlink.MAV_RESULT_ACCEPTED:
             said = "no answer" if self._client.result is None else f"MAV_RESULT {self._client.result}"
             self._report(f"the vehicle does not stream message {self._asked} as asked ({said})")
+            if self._asked in self._required:
+                self._report(f"no flight without message {self._asked}: the scenario needs it")
+                self._enter(Phase.ABORTED, now_us)
+                return
         self._asked = None
         if self._to_ask:
             message_id, interval_us = self._to_ask.pop(0)

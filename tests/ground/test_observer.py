@@ -179,6 +179,40 @@ def test_an_attitude_without_a_position_near_it_is_not_fresh() -> None:
     assert not observer.fresh
 
 
+def test_an_attitude_waits_for_its_position_where_every_one_had_one() -> None:
+    observer = Observer("split")
+    for stamp_us in (4000, 8000, 12_000):
+        observer.receive(attitude(stamp_us))
+        observer.receive(position(stamp_us))
+        assert observer.fresh
+        observer.take()
+    observer.receive(attitude(16_000))
+    assert not observer.fresh
+    observer.receive(position(16_000))
+    assert observer.fresh
+
+
+def test_a_lost_position_delays_the_attitude_by_one_at_most() -> None:
+    observer = Observer("split")
+    for stamp_us in (4000, 8000, 12_000):
+        observer.receive(attitude(stamp_us))
+        observer.receive(position(stamp_us))
+    observer.take()
+    observer.receive(attitude(16_000))
+    observer.receive(attitude(20_000))
+    assert observer.fresh
+
+
+def test_positions_that_come_more_rarely_are_not_waited_for() -> None:
+    observer = Observer("split")
+    for stamp_us in range(20_000, 400_000, 20_000):
+        observer.receive(attitude(stamp_us))
+        assert observer.fresh or stamp_us < 40_000
+        observer.take()
+        if stamp_us % 40_000 == 20_000:
+            observer.receive(position(stamp_us))
+
+
 def test_age_and_validity_are_by_the_ground_s_clock() -> None:
     observer = Observer(max_age_us=500_000)
     assert observer.age_us(7_000_000) is None

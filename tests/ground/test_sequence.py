@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from mavsitl_ground.sequence import FORCE_DISARM
+from mavsitl_ground.sequence import FORCE_DISARM, Handshake, Phase
 
 from mavsitl.codec import packer, parse
 from mavsitl.dialect import mavlink
@@ -18,6 +18,7 @@ LONG = shortened("hover-calm", 60.0)
 HEARTBEAT = packer(mavlink.MAVLink_heartbeat_message)
 ODOMETRY = packer(mavlink.MAVLink_odometry_message)
 COMMAND_LONG = packer(mavlink.MAVLink_command_long_message)
+ODOMETRY_ID, WIND_ID = mavlink.MAVLINK_MSG_ID_ODOMETRY, mavlink.MAVLINK_MSG_ID_DEBUG_VECT
 
 
 def messages(air: Air, message_id: int) -> list[Any]:
@@ -190,3 +191,26 @@ def test_a_refused_arming_is_asked_for_again() -> None:
     assert any("not today" in text for text in air.said)
     commander.arming_refusal = allowed  # type: ignore[method-assign]
     assert air.reaches("FLY")
+
+
+def test_the_oracle_does_not_fly_blind() -> None:
+    """A vehicle that refuses the true wind is not flown under the oracle's name."""
+    sent: list[int] = []
+    said: list[str] = []
+    handshake = Handshake(
+        lambda command, confirmation, params: sent.append(int(params[0])),
+        [(ODOMETRY_ID, 4000), (WIND_ID, 4000)],
+        land=True,
+        required=frozenset((WIND_ID,)),
+        report=said.append,
+    )
+    heartbeat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
+    handshake.on_heartbeat(heartbeat, 1, 1, 0)
+    refusal = mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_RESULT_DENIED)
+    for now_us in range(0, 100_000, 4000):
+        handshake.step(now_us)
+        if sent:
+            sent.clear()
+            handshake.on_message(refusal)
+    assert handshake.phase is Phase.ABORTED
+    assert said[-1] == f"no flight without message {WIND_ID}: the scenario needs it"

@@ -43,7 +43,6 @@ class Vehicle:
         self.autopilot = Autopilot(flight, system_id, ports)
         self.simulation = Simulation(flight, self.autopilot.parameters, seed)
         self._flight = flight
-        self._recorder = recorder
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._record = _Record(recorder, flight, aboard=self._seated is not None)
         self._now_us = -self.period_us
