@@ -13,7 +13,8 @@ from mavsitl.clock import monotonic_us
 from mavsitl.drivers import Progress, Tap
 from mavsitl.link.address import Address
 from mavsitl.link.base import Link
-from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink, open_link
+from mavsitl.link.endpoint import open_link
+from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
 from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
 from mavsitl.log.tlog import TlogWriter
 from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS, Topic

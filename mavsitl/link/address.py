@@ -1,7 +1,8 @@
-"""The endpoint strings of the MAVLink tools: ``udpin:host:port``, ``udpout:host:port``, ``udp:host:port``.
+"""The endpoint strings of the MAVLink tools: ``udpin:host:port``, ``udpout:host:port``, ``tcpin:...``, ``tcp:...``.
 
-``udpin`` listens at the address, ``udpout`` sends to it, ``udp`` is ``udpin`` as in pymavlink. ``udpin://host:port``
-is the same as ``udpin:host:port``. An IPv6 host stands in brackets.
+``udpin`` and ``tcpin`` listen at the address, ``udpout`` sends to it, ``tcp`` connects to it. ``udp`` is ``udpin``, as
+in pymavlink, and ``tcpout`` is ``tcp``. ``udpin://host:port`` is the same as ``udpin:host:port``. An IPv6 host stands
+in brackets.
 """
 
 from __future__ import annotations
@@ -9,12 +10,13 @@ from __future__ import annotations
 import ipaddress
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias
 
-__all__ = ["Address", "AddressError", "parse_address"]
+__all__ = ["Address", "AddressError", "Kind", "parse_address"]
 
 _ALLOWED = (
     "udpin:HOST:PORT (listen there; also udp:HOST:PORT), udpout:HOST:PORT (send there), "
+    "tcpin:HOST:PORT (listen there), tcp:HOST:PORT (connect there; also tcpout:HOST:PORT), "
     "each also as udpin://HOST:PORT; an IPv6 HOST in brackets"
 )
 _PATTERN = re.compile(r"(?P<scheme>[A-Za-z0-9]+):(?P<slashes>//)?(?P<rest>.*)", re.DOTALL)
@@ -26,15 +28,27 @@ class AddressError(ValueError):
     """An endpoint string that is not one; the text quotes it and says what is allowed."""
 
 
+Kind: TypeAlias = Literal["udpin", "udpout", "tcpin", "tcp"]
+
+_KINDS: dict[str, Kind] = {
+    "udp": "udpin",
+    "udpin": "udpin",
+    "udpout": "udpout",
+    "tcp": "tcp",
+    "tcpin": "tcpin",
+    "tcpout": "tcp",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Address:
     """One endpoint. ``str(address)`` is its canonical string, which parses to an equal address."""
 
-    kind: Literal["udpin", "udpout"]
+    kind: Kind
     host: str
     """name or numeric address, IPv6 without brackets"""
     port: int
-    """0 to 65535; 0, "any free port", only for udpin"""
+    """0 to 65535; 0, "any free port", only for udpin and tcpin"""
 
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
@@ -47,18 +61,14 @@ def parse_address(text: str) -> Address:
     if match is None:
         raise AddressError(f"{text!r} is not an endpoint; allowed: {_ALLOWED}")
     scheme = match["scheme"].lower()
-    kind: Literal["udpin", "udpout"]
-    if scheme in ("udp", "udpin"):
-        kind = "udpin"
-    elif scheme == "udpout":
-        kind = "udpout"
-    else:
+    kind = _KINDS.get(scheme)
+    if kind is None:
         raise AddressError(f"{text!r}: no links of type {scheme!r} here; allowed: {_ALLOWED}")
     parts = _HOST_AND_PORT.fullmatch(match["rest"])
     if parts is None:
         raise AddressError(f"{text!r} needs one host and one port after {scheme!r}; allowed: {_ALLOWED}")
     host = _ipv6(text, parts["ipv6"]) if parts["ipv6"] is not None else _host(text, parts["host"])
-    return Address(kind, host, _port(text, parts["port"], least=0 if kind == "udpin" else 1))
+    return Address(kind, host, _port(text, parts["port"], least=0 if kind in ("udpin", "tcpin") else 1))
 
 
 def _ipv6(text: str, host: str) -> str:

@@ -7,16 +7,13 @@ import select
 import socket
 import struct
 import sys
-from typing import Any
 
 from mavsitl.clock import monotonic_us
 from mavsitl.codec import MAX_DATAGRAM_BYTES
-from mavsitl.link.address import Address
 from mavsitl.link.base import LinkError, LinkSilent, Source
+from mavsitl.link.sockets import LOOPBACK, bind_socket, resolve, show
 
-__all__ = ["LOOPBACK", "ConnectedUdp", "UdpLink", "open_link"]
-
-LOOPBACK = "127.0.0.1"
+__all__ = ["LOOPBACK", "ConnectedUdp", "UdpLink"]
 
 MAX_PEERS = 8
 PEER_SILENCE_US = 10_000_000
@@ -24,41 +21,6 @@ PEER_SILENCE_US = 10_000_000
 
 _MAX_RECEIVED = 256  # datagrams in one call, so that a flood cannot hold the caller
 _READ_BYTES = MAX_DATAGRAM_BYTES + 1  # one more than the parser takes: a cut datagram is still seen to be too long
-
-
-def _resolve(host: str, port: int, family: int = socket.AF_UNSPEC) -> tuple[int, Any]:
-    """Address family and numeric socket address."""
-    try:
-        found = socket.getaddrinfo(host, port, family, socket.SOCK_DGRAM)
-    except OSError as error:
-        raise LinkError(f"cannot find the host {host!r}: {error.strerror or error}") from error
-    return int(found[0][0]), found[0][4]
-
-
-def _text(address: Any) -> str:
-    host, port = address[:2]
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
-def _open(bind: tuple[str, int], family: int, port_option: str, host_option: str) -> socket.socket:
-    """A UDP socket bound to an address that nobody else has."""
-    host, port = bind
-    family, address = _resolve(host, port, family)
-    opened = socket.socket(family, socket.SOCK_DGRAM)
-    try:
-        opened.bind(address)
-    except OSError as error:
-        opened.close()
-        if error.errno == errno.EADDRINUSE:
-            text = f"port {port} is in use (bind {host}): choose another with {port_option}"
-        elif error.errno == errno.EACCES:
-            text = f"port {port} is not allowed for this user (bind {host}): choose one above 1023 with {port_option}"
-        elif error.errno == errno.EADDRNOTAVAIL:
-            text = f"{host} is not an address of this machine (port {port}): choose another with {host_option}"
-        else:
-            text = f"cannot bind {host} port {port}: {error.strerror or error}; see {port_option} and {host_option}"
-        raise LinkError(text) from error
-    return opened
 
 
 class UdpLink:
@@ -90,9 +52,9 @@ class UdpLink:
         Raises:
             LinkError: the port is taken, or a host cannot be found or bound.
         """
-        family, _ = _resolve(*bind)
-        self.remote: Source | None = None if remote is None else _resolve(*remote, family)[1]
-        self._socket = _open(bind, family, port_option, host_option)
+        family, _ = resolve(*bind)
+        self.remote: Source | None = None if remote is None else resolve(*remote, family)[1]
+        self._socket = bind_socket(bind, family, socket.SOCK_DGRAM, port_option, host_option)
         self._socket.setblocking(False)
         self.address: Source = self._socket.getsockname()
         self.refused = 0
@@ -122,7 +84,7 @@ class UdpLink:
                 self.refused += 1  # the answer to an earlier send: nobody listens there
             except OSError as error:
                 if error.errno not in (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EMSGSIZE):
-                    raise LinkError(f"cannot receive at {_text(self.address)}: {error.strerror or error}") from error
+                    raise LinkError(f"cannot receive at {show(self.address)}: {error.strerror or error}") from error
                 self.refused += 1
         return received
 
@@ -174,7 +136,7 @@ class UdpLink:
                 self.send_errors += 1
         except OSError as error:
             if error.errno == errno.EMSGSIZE:
-                raise LinkError(f"a datagram of {len(datagram)} bytes is too long for {_text(receiver)}") from error
+                raise LinkError(f"a datagram of {len(datagram)} bytes is too long for {show(receiver)}") from error
             self.send_errors += 1
 
     def _expire(self, now_us: int) -> None:
@@ -184,7 +146,7 @@ class UdpLink:
 
     def _check_open(self) -> None:
         if self._closed:
-            raise LinkError(f"the UDP link {_text(self.address)} is closed")
+            raise LinkError(f"the UDP link {show(self.address)} is closed")
 
 
 class ConnectedUdp:
@@ -213,16 +175,16 @@ class ConnectedUdp:
         """
         if not timeout_s >= 1e-6:
             raise ValueError(f"timeout_s is {timeout_s}; allowed: at least one microsecond")
-        family, _ = _resolve(*bind)
-        self.remote: Source = _resolve(*remote, family)[1]
-        self._socket = _open(bind, family, port_option, host_option)
+        family, _ = resolve(*bind)
+        self.remote: Source = resolve(*remote, family)[1]
+        self._socket = bind_socket(bind, family, socket.SOCK_DGRAM, port_option, host_option)
         self.address: Source = self._socket.getsockname()
         self._timeout_s = timeout_s
         try:
             self._socket.connect(self.remote)
         except OSError as error:
             self._socket.close()
-            raise LinkError(f"no way from {bind[0]} to {_text(self.remote)}: {error.strerror or error}") from error
+            raise LinkError(f"no way from {bind[0]} to {show(self.remote)}: {error.strerror or error}") from error
         self._set_timeout(timeout_s)
 
     def receive(self) -> bytes:
@@ -289,29 +251,9 @@ class ConnectedUdp:
 
     def _silence(self) -> LinkSilent:
         return LinkSilent(
-            f"nothing came from {_text(self.remote)} to {_text(self.address)} within {self._timeout_s:g} s: "
+            f"nothing came from {show(self.remote)} to {show(self.address)} within {self._timeout_s:g} s: "
             "is the other side running, and does it send there?"
         )
 
     def _failure(self, what: str, error: OSError) -> LinkError:
-        return LinkError(f"cannot {what} at {_text(self.address)} ({_text(self.remote)}): {error.strerror or error}")
-
-
-def open_link(address: Address, *, port_option: str = "--port ...", host_option: str = "--bind ...") -> UdpLink:
-    """The link that an endpoint string means: ``udpin`` binds it, ``udpout`` sends to it from a free port.
-
-    The free port is on the one local address from which the remote is reached, not on all of them.
-
-    Raises:
-        LinkError: the address cannot be bound, found or reached.
-    """
-    if address.kind == "udpin":
-        return UdpLink((address.host, address.port), port_option=port_option, host_option=host_option)
-    family, remote = _resolve(address.host, address.port)
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(remote)  # sends nothing: it only asks the routing table
-        except OSError as error:
-            raise LinkError(f"no way to {_text(remote)}: {error.strerror or error}") from error
-        local_host = str(probe.getsockname()[0])
-    return UdpLink((local_host, 0), remote[:2], port_option=port_option, host_option=host_option)
+        return LinkError(f"cannot {what} at {show(self.address)} ({show(self.remote)}): {error.strerror or error}")

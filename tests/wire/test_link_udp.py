@@ -10,9 +10,8 @@ from contextlib import ExitStack, closing
 import pytest
 
 from mavsitl.codec import MAX_DATAGRAM_BYTES
-from mavsitl.link.address import parse_address
 from mavsitl.link.base import Link, LinkError, LinkSilent, Source
-from mavsitl.link.udp import LOOPBACK, MAX_PEERS, PEER_SILENCE_US, ConnectedUdp, UdpLink, open_link
+from mavsitl.link.udp import LOOPBACK, MAX_PEERS, PEER_SILENCE_US, ConnectedUdp, UdpLink
 
 pytestmark = pytest.mark.sockets
 
@@ -171,17 +170,6 @@ def test_a_closed_link_says_so(udp: Callable[..., UdpLink]) -> None:
     for use in (lambda: link.receive(0), lambda: link.send(b""), lambda: link.wait(0.0), lambda: link.admit((), 0)):
         with pytest.raises(LinkError, match="closed"):
             use()
-
-
-def test_endpoint_strings_open_links() -> None:
-    with closing(open_link(parse_address("udpin:127.0.0.1:0"))) as listener:
-        port = listener.address[1]
-        with closing(open_link(parse_address(f"udpout:127.0.0.1:{port}"))) as sender:
-            assert listener.remote is None
-            assert sender.remote == listener.address
-            assert sender.address[0] == LOOPBACK
-            sender.send(b"hello")
-            assert next_datagram(listener) == (b"hello", sender.address)
 
 
 def test_turns_over_connected_sockets(udp: Callable[..., UdpLink]) -> None:
