@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mavsitl.codec import Counters, Frame, Message, Packer, encode, parse
+from mavsitl.signing import LinkSigning
 
 __all__ = ["DATAGRAM_BYTES", "MAX_SOURCES", "Node", "SourceStatistics"]
 
@@ -71,9 +72,10 @@ class Node:
         counters: what became of the input, see `mavsitl.codec.Counters`.
         own_frames: frames dropped because they carry the node's own address (an echo).
         sources: statistics by (system id, component id), at most `MAX_SOURCES`.
+        signing: signs and checks what passes, see `mavsitl.signing`; None for a link that knows no signatures.
     """
 
-    def __init__(self, system_id: int, component_id: int) -> None:
+    def __init__(self, system_id: int, component_id: int, signing: LinkSigning | None = None) -> None:
         for name, value in (("system_id", system_id), ("component_id", component_id)):
             if not 1 <= value <= 255:
                 raise ValueError(f"{name} is {value}; allowed: 1 to 255")
@@ -81,6 +83,7 @@ class Node:
         self.component_id = component_id
         self.counters = Counters()
         self.own_frames = 0
+        self.signing = signing
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
         self._sequence = 0
         self._frames_heard = 0
@@ -100,6 +103,10 @@ class Node:
         self._outbox.append(encode(message, self._sequence, self.system_id, self.component_id))
         self._sequence = (self._sequence + 1) & 0xFF
 
+    def forward(self, frame: bytes) -> None:
+        """Queue another component's frame as it is, with its sequence number and signature."""
+        self._outbox.append(frame)
+
     def datagrams(self, max_bytes: int = DATAGRAM_BYTES, combine: bool = False) -> list[bytes]:
         """Take the queued frames as datagrams, in order.
 
@@ -108,6 +115,8 @@ class Node:
             combine: put as many frames into a datagram as fit, instead of one frame each, which is what PX4 does.
         """
         frames, self._outbox = self._outbox, []
+        if self.signing is not None:
+            frames = self.signing.outgoing(frames, (self.system_id, self.component_id))
         if not combine:
             return frames
         datagrams: list[bytes] = []
@@ -124,8 +133,13 @@ class Node:
         return datagrams
 
     def receive(self, datagram: bytes) -> list[Frame]:
-        """The good frames of one datagram, the node's own left out, whomever they are meant for; never raises."""
+        """The good frames of one datagram, the node's own left out, whomever they are meant for; never raises.
+
+        With signing those that are not believed are left out too, and every SETUP_SIGNING.
+        """
         frames = parse(datagram, self.counters)
+        if self.signing is not None:
+            frames = self.signing.incoming(frames, (self.system_id, self.component_id))
         own = False
         for frame in frames:
             if frame.system_id == self.system_id and frame.component_id == self.component_id:

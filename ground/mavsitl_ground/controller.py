@@ -25,6 +25,7 @@ from mavsitl.log.ulog import Recorder
 from mavsitl.node import Node
 from mavsitl.quaternion import from_euler
 from mavsitl.scenario import Flight, ScenarioError
+from mavsitl.services.statustext import Joiner
 from mavsitl_ground import demand
 from mavsitl_ground.observer import Observer
 from mavsitl_ground.reference import reference_for
@@ -236,6 +237,7 @@ class Ground:
         self._observer = Observer(scenario.controller.telemetry)
         self._controller = Controller(flight)
         self._report = report
+        self._texts = Joiner()
         messages = [(message_id, self.period_us) for message_id in STATE_MESSAGES[scenario.controller.telemetry]]
         messages.append((mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, SYS_STATE_INTERVAL_US))
         required: frozenset[int] = frozenset()
@@ -297,12 +299,16 @@ class Ground:
                 self._observer.receive(message)
                 handshake.on_message(message)
                 if type(message).id == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
-                    self._report(f"vehicle: {message.text}")
+                    sender = (frame.system_id, frame.component_id)
+                    for text in self._texts.receive(message, sender, self._now_us):
+                        self._report(f"vehicle: {text.text}")
         return len(frames)
 
     def step(self, now_us: int) -> None:
         """At least every control period, and after each datagram: control on new state, handshake, heartbeat."""
         self._now_us = now_us
+        for text in self._texts.step(now_us):
+            self._report(f"vehicle: {text.text}")
         handshake, state = self._handshake, self._observer
         before = handshake.phase
         restarted = state.restarted

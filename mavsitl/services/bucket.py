@@ -1,0 +1,30 @@
+"""A token bucket in integer time: what keeps answers, texts and lists from flooding a link."""
+
+from __future__ import annotations
+
+__all__ = ["TokenBucket"]
+
+
+class TokenBucket:
+    """Holds `burst` tokens and gains `rate_hz` a second; full at first."""
+
+    __slots__ = ("_capacity", "_credit", "_filled_us", "_rate_hz")
+
+    def __init__(self, rate_hz: float, burst: float) -> None:
+        """Raises `ValueError` unless both are above 0 and `burst` holds a whole token."""
+        if not (rate_hz > 0.0 and burst >= 1.0):
+            raise ValueError(f"rate_hz is {rate_hz}, burst {burst}; allowed: above 0, and 1 or more")
+        # In millionths of a token: time then adds whole numbers at whole rates, and nothing is lost by rounding.
+        self._rate_hz = rate_hz
+        self._capacity = self._credit = burst * 1e6
+        self._filled_us: int | None = None
+
+    def take(self, now_us: int, tokens: float = 1.0) -> bool:
+        """Whether that many tokens were there; if so they are gone. A clock that goes back gains nothing."""
+        if self._filled_us is not None and now_us > self._filled_us:
+            self._credit = min(self._capacity, self._credit + (now_us - self._filled_us) * self._rate_hz)
+        self._filled_us = now_us
+        if self._credit < tokens * 1e6:
+            return False
+        self._credit -= tokens * 1e6
+        return True
