@@ -70,7 +70,7 @@ everybody who can reach the port can fly the vehicle.
 
 VEHICLE_EXAMPLES = """\
 examples:
-  mavsitl vehicle                                    hover-calm's vehicle and air, on PX4's ports
+  mavsitl vehicle                                    a vehicle on the ground, in calm air, on PX4's ports
   mavsitl vehicle hover-wind --instance 1            a second one: ports 18571, 14581, system id 2
   mavsitl vehicle hover-wind --bind 0.0.0.0 --offboard-remote 192.0.2.7:14540
 """
@@ -219,9 +219,9 @@ def _add_vehicle(commands: Any) -> None:
     parser.add_argument(
         "scenario",
         nargs="?",
-        default="hover-calm",
+        default="takeoff-hover",
         metavar="SCENARIO",
-        help="its airframe, air, start (default: hover-calm)",
+        help="its airframe, air, start (default: takeoff-hover)",
     )
     _add_scenario_options(parser)
     group = parser.add_argument_group("link")
@@ -248,7 +248,16 @@ def _add_vehicle(commands: Any) -> None:
         "--gcs-port", type=_PORT, metavar="N", help="local port of the ground-station link (default: 18570 + I)"
     )
     group.add_argument("--gcs-remote", metavar="HOST:PORT", help="where it sends first (default: 127.0.0.1:14550)")
+    group.add_argument(
+        "--tcp-port", type=_PORT, metavar="N", help="also a TCP server for ground stations, e.g. 5760 (default: none)"
+    )
     _add_end_options(parser)
+    group = parser.add_argument_group("state")
+    group.add_argument(
+        "--state-dir", type=Path, metavar="DIR",
+        help="keeps parameters, missions and the card (default: in the user's data folder, by system id)",
+    )  # fmt: skip
+    group.add_argument("--no-state", action="store_true", default=None, help="begin fresh and keep nothing")
     parser.add_argument(
         "--speed",
         type=_speed,
@@ -265,9 +274,9 @@ def _add_ground(commands: Any) -> None:
     parser.add_argument(
         "scenario",
         nargs="?",
-        default="hover-calm",
+        default="takeoff-hover",
         metavar="SCENARIO",
-        help="its controller and reference (default: hover-calm)",
+        help="its controller and reference (default: takeoff-hover)",
     )
     _add_scenario_options(parser)
     group = parser.add_argument_group("link")
@@ -557,6 +566,19 @@ def _check_lockstep(
             raise UsageError(f"{name}: {needed} --lockstep")
 
 
+def _state_folder(options: argparse.Namespace, system_id: int) -> Path | None:
+    if options.no_state:
+        if options.state_dir is not None:
+            raise UsageError("--state-dir: not with --no-state")
+        return None
+    if options.state_dir is not None:
+        folder: Path = options.state_dir
+        return folder
+    from platformdirs import user_data_path
+
+    return user_data_path("mavsitl", appauthor=False) / f"vehicle-{system_id}"
+
+
 def _vehicle(options: argparse.Namespace) -> int:
     from mavsitl import ends
 
@@ -570,9 +592,13 @@ def _vehicle(options: argparse.Namespace) -> int:
         offboard_remote=_endpoint(offboard_remote, "--offboard-remote"),
         gcs_port=options.gcs_port if options.gcs_port is not None else ends.GCS_PORT + instance,
         gcs_remote=_endpoint(options.gcs_remote or f"127.0.0.1:{ends.GCS_REMOTE_PORT}", "--gcs-remote"),
+        tcp_port=options.tcp_port,
     )
     _check_lockstep(
-        options, real_time_only=("--speed", "--until-disarmed", "--gcs-port", "--gcs-remote"),
+        options,
+        real_time_only=(
+            "--speed", "--until-disarmed", "--gcs-port", "--gcs-remote", "--tcp-port", "--state-dir", "--no-state"
+        ),
         lockstep_only=("--deadline", "--cpu"),
     )  # fmt: skip
     status = _Status(options.status == "json")
@@ -595,7 +621,8 @@ def _vehicle(options: argparse.Namespace) -> int:
         )
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
-            until_finished=bool(options.until_disarmed), stop=status.stop, progress=None,
+            until_finished=bool(options.until_disarmed), state=_state_folder(options, system_id),
+            stop=status.stop, progress=None,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK

@@ -159,6 +159,11 @@ class PacedClock:
         return self.now_us * 1000 / elapsed_ns if elapsed_ns > 0 else 0.0
 
 
+def unix_us() -> int:
+    """Microseconds since 1970 by the system's clock, which may jump: for time stamps alone."""
+    return time.time_ns() // 1000
+
+
 def utc_stamp() -> str:
     """The wall clock in UTC, ISO 8601 to the second, for names and headers only."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

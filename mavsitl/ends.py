@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mavsitl import __version__, drivers, wings
-from mavsitl.clock import monotonic_us
+from mavsitl.clock import monotonic_us, unix_us
 from mavsitl.drivers import Progress, Tap
 from mavsitl.link.address import Address
 from mavsitl.link.base import Link
 from mavsitl.link.endpoint import open_link
+from mavsitl.link.tcp import TcpServerLink
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
 from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
 from mavsitl.log.tlog import TlogWriter
@@ -114,6 +115,8 @@ class VehicleLinks:
     offboard_remote: tuple[str, int] = (LOOPBACK, OFFBOARD_REMOTE_PORT)
     gcs_port: int = GCS_PORT
     gcs_remote: tuple[str, int] = (LOOPBACK, GCS_REMOTE_PORT)
+    tcp_port: int | None = None
+    """Of a TCP server for ground stations; None: none."""
 
 
 def vehicle_lockstep(
@@ -171,10 +174,13 @@ def ground_lockstep(
 
 def vehicle_realtime(
     flight: Flight, links: VehicleLinks, folder: Path | None, *,
-    system_id: int, wing: str | None, speed: float, until_finished: bool,
+    system_id: int, wing: str | None, speed: float, until_finished: bool, state: Path | None,
     stop: Callable[[], bool], progress: Progress | None,
 ) -> Outcome:  # fmt: skip
-    """The vehicle on the wall clock, with PX4 SITL's two links. Raises as `vehicle_lockstep`."""
+    """The vehicle on the wall clock, with PX4 SITL's two links and TCP where asked for. Raises as `vehicle_lockstep`.
+
+    `state` is the folder of what outlives the process, None: nothing does.
+    """
     opened: list[Link] = []
     try:
         opened.append(
@@ -190,20 +196,22 @@ def vehicle_realtime(
                 (links.bind, links.gcs_port), links.gcs_remote, port_option="--gcs-port N", host_option="--bind HOST"
             )
         )
+        if links.tcp_port is not None:
+            opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
         with _logs(folder, VEHICLE_END, flight) as (recorder, tap):
             build = wings.find(wings.VEHICLE_GROUP, wing)
             core = build(
-                flight,
-                recorder,
-                seed=flight.scenario.seed,
-                system_id=system_id,
-                ports=("offboard", "gcs"),
-                lockstep=False,
-            )
+                flight, recorder, seed=flight.scenario.seed, system_id=system_id,
+                ports=("offboard", *["gcs"] * (len(opened) - 1)), lockstep=False,
+                state=state, logs=folder, unix_us=unix_us,
+            )  # fmt: skip
             watch = _Watch(core)
-            timing = drivers.run_realtime_vehicle(
-                core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, progress=progress
-            )
+            try:
+                timing = drivers.run_realtime_vehicle(
+                    core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, progress=progress
+                )
+            finally:
+                core.close()
             lateness = (timing.lateness.p50_us, timing.lateness.p99_us)
             return watch.outcome(timing.simulated_us, tap, lateness, timing.rebased, wall_us=timing.wall_us)
     finally:

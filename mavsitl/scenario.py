@@ -52,6 +52,11 @@ class Start(Section, frozen=True):
     yaw_deg: float = 0.0
     clamp: bool = False
     """Held at the start pose, rotors free, until it has been armed in OFFBOARD for COM_SPOOLUP_TIME."""
+    latitude_deg: Annotated[float, msgspec.Meta(ge=-90.0, le=90.0)] = 47.397742
+    """Of the world's origin, with the two below; defaults are PX4 SITL's home."""
+    longitude_deg: Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)] = 8.545594
+    altitude_amsl_m: Annotated[float, msgspec.Meta(ge=-500.0, le=10_000.0)] = 488.0
+    """Of the plane z = 0."""
 
 
 class Offnominal(Section, frozen=True):

@@ -6,6 +6,10 @@
     Name, title and description of each shipped scenario.
 ``{shipped-airframes}``
     Each shipped airframe's numbers side by side.
+``{streams}``
+    The vehicle's telemetry: each message with its default rates on both links, PX4's beside, and their sums.
+``{parameter-tables}``
+    A section for each group of the vehicle's parameters: name, type, default, allowed values, meaning.
 ``{cli-help} SUBCOMMAND``
     What ``mavsitl SUBCOMMAND --help`` prints.
 """
@@ -20,10 +24,12 @@ import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from importlib import import_module, resources
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 from docutils import nodes
+from mavsitl_vehicle.autopilot import telemetry
+from mavsitl_vehicle.autopilot.parameters import TABLE, Parameter
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.typing import ExtensionMetadata
@@ -47,6 +53,9 @@ UNITS = {
     "kg_m3": "kg/m³",
     "n_s2": "N s²",
     "n_m_s2": "N m s²",
+    "ah": "A h",
+    "ohm": "Ω",
+    "w": "W",
 }
 """What ends a key, and the unit it stands for."""
 
@@ -224,6 +233,65 @@ class ShippedAirframes(GeneratedDirective):
         return [self.table(("key", "unit", *names), rows)]
 
 
+class Streams(GeneratedDirective):
+    """The one table of `mavsitl_vehicle.autopilot.telemetry`."""
+
+    def run(self) -> list[nodes.Node]:
+        streams = telemetry.STREAMS
+        rows = [
+            [self.code(row.name), *(self.text(rate(hz)) for hz in self.rates(row)), self.text(row.note)]
+            for row in streams
+        ]
+        sums = [sum(column) for column in zip(*(self.rates(row) for row in streams), strict=True)]
+        rows.append([self.text("sum"), *(self.text(rate(hz)) for hz in sums), self.text("with everything being sent")])
+        header = ("message", "ground station, Hz", "PX4", "off-board, Hz", "PX4", "note")
+        return [self.table(header, rows)]
+
+    def rates(self, row: telemetry.Stream) -> tuple[float, float, float, float]:
+        return row.gcs_hz, row.px4_gcs_hz, row.offboard_hz, row.px4_offboard_hz
+
+
+def rate(hz: float) -> str:
+    return f"{hz:g}" if hz else "–"
+
+
+class ParameterTables(GeneratedDirective):
+    EFFECT: ClassVar[dict[str, str]] = {
+        "now": "",
+        "arming": "Takes effect at the next arming. ",
+        "boot": "Takes effect at the next start. ",
+    }
+
+    def run(self) -> list[nodes.Node]:
+        groups: dict[str, list[Parameter]] = {}
+        for row in TABLE.values():
+            groups.setdefault(row.group, []).append(row)
+        header = ("name", "type", "default", "allowed", "meaning", "beside PX4 1.17")
+        return [
+            self.section(group, self.table(header, [self.row(row) for row in rows])) for group, rows in groups.items()
+        ]
+
+    def row(self, row: Parameter) -> list[list[nodes.Node]]:
+        default = f"{row.default:d}" if isinstance(row.default, int) else f"{row.default:g}"
+        named = row.values or row.bits
+        allowed = "; ".join(f"{key}: {text}" for key, text in sorted(named.items()))
+        if row.bits:
+            allowed = f"bits {allowed}"
+        meaning = f"{row.text}. {row.long} {self.EFFECT[row.live]}"
+        if row.read_only:
+            meaning += "Read-only. "
+        if row.used_by == "client":
+            meaning += "For ground stations; the vehicle does not act on it."
+        return [
+            self.code(row.name),
+            self.text(row.type),
+            self.code(default),
+            self.text(allowed or row.allowed),
+            self.text(" ".join(meaning.split())),
+            self.text(row.note),
+        ]
+
+
 class CliHelp(GeneratedDirective):
     optional_arguments = 1
 
@@ -246,5 +314,7 @@ def setup(app: Sphinx) -> ExtensionMetadata:
     app.add_directive("struct-tables", StructTables)
     app.add_directive("shipped-scenarios", ShippedScenarios)
     app.add_directive("shipped-airframes", ShippedAirframes)
+    app.add_directive("streams", Streams)
+    app.add_directive("parameter-tables", ParameterTables)
     app.add_directive("cli-help", CliHelp)
     return {"version": "1", "parallel_read_safe": True}

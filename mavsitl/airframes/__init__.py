@@ -32,6 +32,15 @@ class Airframe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     rotor_time_constant_s: NonNegative
     """First-order lag of the rotor speed; 0 is an ideal rotor."""
     gravity_m_s2: Positive = 9.81
+    battery_cells: Annotated[int, msgspec.Meta(ge=1, le=14)] = 3
+    """Lithium-polymer cells in series."""
+    battery_capacity_ah: Positive = 2.2
+    battery_cell_resistance_ohm: NonNegative = 0.005
+    """Internal resistance of one cell (BAT1_R_INTERNAL)."""
+    battery_efficiency: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.6
+    """Mechanical power at the rotors by electrical power: propeller drive and speed controller."""
+    battery_hotel_w: NonNegative = 5.0
+    """What the rest of the vehicle draws."""
     parameters: dict[str, float] = {}
     """PX4 parameters of this airframe that differ from the vehicle's defaults (e.g. MC_ROLLRATE_P)."""
 

@@ -96,7 +96,11 @@ class Client:
         ]
 
     def last(self, name: str, port: int | None = None) -> Any:
-        return self.all(name, port)[-1]
+        return next(
+            message
+            for _, from_port, message in reversed(self.inbox)
+            if message.get_type() == name and port in (None, from_port)
+        )
 
     def texts(self, port: int = GCS) -> list[str]:
         """STATUSTEXT, its chunks joined."""

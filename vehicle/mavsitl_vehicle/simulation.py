@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from math import nan, radians
 
+import msgspec
 import numpy as np
 
 from mavsitl import seeds
-from mavsitl.scenario import Flight
+from mavsitl.frames import Vector
+from mavsitl.quaternion import conjugate, rotate
+from mavsitl.scenario import DrydenMil, Flight, Steady, Wind
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot.parameters import Parameters
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint
 from mavsitl_vehicle.plant.parameters import plant_parameters
 from mavsitl_vehicle.plant.state import initial_state
-from mavsitl_vehicle.wind.field import WindField
+from mavsitl_vehicle.wind.field import WindField, mil_axes
+
+TURBULENCE_HEIGHT_M = 6.096
+"""20 ft: where SIM_WIND_W20 is given, and its turbulence taken."""
 
 BLOCK_TICKS = 250
 """Normals are drawn for this many ticks at once."""
@@ -23,13 +29,15 @@ class Simulation:
     """Arrays have the fleet axis last: `x` (17, n) the truth, `estimate` (13, n) what sensors say, `wind` (3, n)."""
 
     def __init__(self, flight: Flight, parameters: Parameters, seed: int, n: int = 1) -> None:
-        scenario, airframe = flight.scenario, flight.airframe
+        scenario = flight.scenario
         self.n = n
+        self._flight = flight
+        self._parameters = parameters
         self.substeps = scenario.rates.substeps
         self.dt_s = 1.0 / scenario.rates.physics_hz
         self._start = initial_state(scenario.start.position_nwu_m, radians(scenario.start.yaw_deg), 0.0, n)
         self.x = self._start.copy()
-        self.plant = plant_parameters(airframe, scenario.offnominal, scenario.ground_contact, n)
+        self.plant = self._plant()
         self.field = WindField(scenario.wind, n, self.dt_s)
         self.wind = np.zeros((3, n))
         self.estimate = np.zeros((tick.ESTIMATE_ROWS, n))
@@ -38,16 +46,18 @@ class Simulation:
         self.inner = np.zeros((tick.INNER_ROWS, n))
         self.held = np.full(n, scenario.start.clamp)
         self.gains = _gains(flight, parameters)
-        noise = scenario.noise
-        self.sigma = np.array(
-            [noise.position_m, noise.velocity_m_s, radians(noise.attitude_deg), radians(noise.rate_deg_s)]
-        )
+        self.sigma = self._sigma()
+        self._velocity = self.x[3:6].copy()
+        """At the beginning of the tick."""
         self._command = np.zeros((4, n))
         self._wind_generators = [seeds.generator(seed, "vehicle", j, "wind") for j in range(n)]
         self._sensor_generators = [seeds.generator(seed, "vehicle", j, "sensors") for j in range(n)]
         per_reset = self.field.normals_for_reset
         self.field.reset(np.stack([g.standard_normal(per_reset) for g in self._wind_generators], axis=-1))
         self._tick = 0
+        self._scenario_rows = self.field.normals_per_step
+        if winds := self._parameter_winds():
+            self._set_winds(winds)
         self._sensor_block = np.zeros((0, 0, n))
         self._wind_block = np.zeros((0, 0, n))
         self._draw()
@@ -77,6 +87,63 @@ class Simulation:
         """At rest at the start pose, rotors still; time, wind and sensors go on."""
         self.x[:] = self._start
 
+    def set_parameter(self, name: str) -> None:
+        """Take up a parameter that was changed in flight; those that are none of the simulation's change nothing."""
+        if name.startswith("MC_"):
+            self.gains = _gains(self._flight, self._parameters)
+        elif name == "SIM_NOISE_SCALE":
+            self.sigma = self._sigma()
+            self.gains = _gains(self._flight, self._parameters)
+        elif name == "SIM_MASS_SCALE":
+            self.plant = self._plant()
+        elif name.startswith("SIM_WIND_"):
+            self._set_winds(self._parameter_winds())
+            self._draw()
+
+    def specific_force(self, j: int) -> Vector:
+        """What an accelerometer at the centre measures, mean over the last tick, m/s^2 FLU: (0, 0, g) at rest."""
+        period_s = self.substeps * self.dt_s
+        ax, ay, az = ((self.x[3:6, j] - self._velocity[:, j]) / period_s).tolist()
+        w, x, y, z = self.x[6:10, j].tolist()
+        return rotate(conjugate((w, x, y, z)), (ax, ay, az + self._flight.airframe.gravity_m_s2))
+
+    def _plant(self) -> tick.Array:
+        scenario = self._flight.scenario
+        offnominal = scenario.offnominal
+        scale = offnominal.mass_scale * self._parameters["SIM_MASS_SCALE"]
+        offnominal = msgspec.structs.replace(offnominal, mass_scale=scale)
+        return plant_parameters(self._flight.airframe, offnominal, scenario.ground_contact, self.n)
+
+    def _sigma(self) -> tick.Array:
+        noise = self._flight.scenario.noise
+        sigma = [noise.position_m, noise.velocity_m_s, radians(noise.attitude_deg), radians(noise.rate_deg_s)]
+        return np.array(sigma) * self._parameters["SIM_NOISE_SCALE"]
+
+    def _parameter_winds(self) -> tuple[Wind, ...]:
+        """SIM_WIND_*: a mean wind, and turbulence, on top of the scenario's."""
+        p = self._parameters
+        from_deg = p["SIM_WIND_DIR"]
+        winds: list[Wind] = []
+        if p["SIM_WIND_SPD"] > 0.0:
+            x, y, z = (p["SIM_WIND_SPD"] * mil_axes(from_deg)[0]).tolist()
+            winds.append(Steady(velocity_nwu_m_s=(x, y, z)))
+        if p["SIM_WIND_TURB"]:
+            winds.append(
+                DrydenMil(wind_speed_20ft_m_s=p["SIM_WIND_W20"], altitude_m=TURBULENCE_HEIGHT_M, from_deg=from_deg)
+            )
+        return tuple(winds)
+
+    def _set_winds(self, added: tuple[Wind, ...]) -> None:
+        """The scenario's winds, whose turbulence goes on, and `added`, whose turbulence begins stationary."""
+        extra = WindField(added, self.n, self.dt_s)
+        rows = extra.normals_for_reset
+        extra.reset(np.stack([g.standard_normal(rows) for g in self._wind_generators], axis=-1))
+        field = WindField(self._flight.scenario.wind + added, self.n, self.dt_s)
+        kept = self._scenario_rows
+        field.state[:kept] = self.field.state[:kept]
+        field.state[kept:] = extra.state
+        self.field = field
+
     def advance(self, flight_time_s: float) -> None:
         """One control period: the inner loops and the physics at the physics rate, then the sensors.
 
@@ -85,6 +152,7 @@ class Simulation:
         row = self._tick % BLOCK_TICKS
         if row == 0 and self._tick:
             self._draw()
+        self._velocity[:] = self.x[3:6]
         field = self.field
         tick.advance(
             self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._command,
@@ -124,7 +192,9 @@ def _gains(flight: Flight, parameters: Parameters) -> tick.Array:
     gains = np.zeros(tick.GAIN_ROWS)
     gains[tick.ATTITUDE_P : tick.ATTITUDE_P + 3] = p["MC_ROLL_P"], p["MC_PITCH_P"], p["MC_YAW_P"]
     for row, letter in ((tick.RATE_P, "P"), (tick.RATE_I, "I"), (tick.RATE_D, "D")):
-        gains[row : row + 3] = [p[f"MC_{axis}RATE_{letter}"] for axis in ("ROLL", "PITCH", "YAW")]
+        gains[row : row + 3] = [
+            p[f"MC_{axis}RATE_K"] * p[f"MC_{axis}RATE_{letter}"] for axis in ("ROLL", "PITCH", "YAW")
+        ]
     gains[tick.RATE_INTEGRAL_LIMIT : tick.RATE_INTEGRAL_LIMIT + 3] = [
         p[f"MC_{axis}_INT_LIM"] for axis in ("RR", "PR", "YR")
     ]
@@ -136,5 +206,5 @@ def _gains(flight: Flight, parameters: Parameters) -> tick.Array:
     gains[tick.DRAG_COEFFICIENT] = airframe.drag_coefficient_n_m_s2
     gains[tick.ARM] = airframe.arm_m
     gains[tick.MAX_ROTOR_SPEED] = airframe.max_rotor_speed_rad_s
-    gains[tick.GYRO_SIGMA] = radians(flight.scenario.noise.rate_deg_s)
+    gains[tick.GYRO_SIGMA] = radians(flight.scenario.noise.rate_deg_s) * p["SIM_NOISE_SCALE"]
     return gains

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mavsitl.dialect import mavlink
-from mavsitl.frames import flip_quaternion
+from mavsitl.frames import Vector, flip_quaternion
 from mavsitl.log import topics
 from mavsitl.log.block import Array, Block, ned
 from mavsitl.log.ulog import Recorder
@@ -16,10 +18,17 @@ from mavsitl.scenario import Flight
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot import modes
 from mavsitl_vehicle.autopilot.autopilot import Autopilot
+from mavsitl_vehicle.autopilot.battery import settings as battery_settings
 from mavsitl_vehicle.autopilot.modes import Mode
+from mavsitl_vehicle.autopilot.parameters import Layer, Parameters
+from mavsitl_vehicle.autopilot.plan import PlanError, VehiclePlan
+from mavsitl_vehicle.autopilot.ports import Shared
 from mavsitl_vehicle.autopilot.seated import SeatedLaw
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint
+from mavsitl_vehicle.autopilot.storage import Store, keep_parameters
 from mavsitl_vehicle.simulation import Simulation
+
+PLAN_SCHEMA = 1
 
 
 class Vehicle:
@@ -34,23 +43,75 @@ class Vehicle:
         system_id: int = 1,
         ports: Sequence[str] = ("offboard",),
         lockstep: bool = False,
+        state: Path | None = None,
+        logs: Path | None = None,
+        unix_us: Callable[[], int] | None = None,
     ) -> None:
         """`ports` name the links in order: "offboard", "gcs".
 
-        In `lockstep` the state is streamed every tick from the first.
+        In `lockstep` the state is streamed every tick from the first. `state` is a folder for what outlives the process
+        (parameters, plans, the memory card), `logs` where its logs are; None: nothing is kept, or shown. `unix_us` is
+        the wall clock, for SYSTEM_TIME; None: not known.
         """
         self.period_us = flight.scenario.rates.control_period_us
-        self.autopilot = Autopilot(flight, system_id, ports)
-        self.simulation = Simulation(flight, self.autopilot.parameters, seed)
         self._flight = flight
+        self._seed = seed
+        self._system_id = system_id
+        self._port_names = tuple(ports)
+        self._lockstep = lockstep
+        self._unix_us = unix_us
+        self._notes: list[str] = []
+        """What was wrong with the stored state, for a STATUSTEXT at the first step."""
+        self.parameters = Parameters(
+            Layer(f"airframe {flight.scenario.airframe}", flight.airframe.parameters),
+            Layer(flight.name, flight.scenario.parameters),
+            Layer("system id", {"MAV_SYS_ID": system_id}),
+        )
+        parameter_store = keep_parameters(self.parameters, state, self._notes.append)
+        self.parameters.put("MAV_SYS_ID", system_id)  # what was kept does not outweigh what was asked for
+        plan_store = Store(state, "plan", PLAN_SCHEMA, self._notes.append)
+        self._stores = (parameter_store, plan_store)
+        self.plan = VehiclePlan(
+            report=lambda severity, text: self.autopilot.queue_text(severity, text),
+            changed=lambda mission_type: plan_store.put(json.loads(self.plan.to_json())),
+        )
+        self._load_plan(plan_store)
+        card = None if state is None else state / "card"
+        self._shared = Shared(self.parameters, self.plan, card=card, logs=logs)
+        self.simulation = Simulation(flight, self.parameters, seed)
+        self.autopilot = self._boot(0)
+        self.parameters.subscribe(self._on_parameter)
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._record = _Record(recorder, flight, aboard=self._seated is not None)
         self._now_us = -self.period_us
+        self._boot_us = 0
+        """The driver's time at which the autopilot booted last."""
         self._done = False
-        if lockstep:
-            for port in self.autopilot.ports:
-                for message_id in _STATE_MESSAGES[flight.scenario.controller.telemetry]:
+
+    def _load_plan(self, store: Store) -> None:
+        content = store.load()
+        if content:
+            try:
+                self.plan.load_json(json.dumps(content))
+            except PlanError as error:
+                self._notes.append(f"{store.path}: left out: {error}")
+
+    def _boot(self, now_us: int) -> Autopilot:
+        """An autopilot whose clock begins at `now_us` of the driver's."""
+        unix_us = 0 if self._unix_us is None else self._unix_us()
+        autopilot = Autopilot(
+            self._flight, self._system_id, self._port_names, self.parameters, _Body(self.simulation), self._shared,
+            lockstep=self._lockstep, unix_boot_us=unix_us,
+        )  # fmt: skip
+        autopilot.estimate = self.simulation.estimate[:, 0].tolist()
+        if self._lockstep:
+            for port in autopilot.ports:
+                for message_id in _STATE_MESSAGES[self._flight.scenario.controller.telemetry]:
                     port.schedule.set_interval(message_id, self.period_us, 0)
+        for note in self._notes:
+            autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, note)
+        self._notes.clear()
+        return autopilot
 
     @property
     def token_us(self) -> int:
@@ -76,7 +137,7 @@ class Vehicle:
     def flight_time_s(self) -> float:
         """Since the release; negative before it."""
         released = self.autopilot.released_us
-        return -1.0 if released is None else (self._now_us - released) / 1e6
+        return -1.0 if released is None else (self._now_us - self._boot_us - released) / 1e6
 
     @property
     def counters(self) -> Any:
@@ -85,46 +146,68 @@ class Vehicle:
 
     def receive(self, port: int, datagram: bytes) -> int:
         """One datagram from a link; the number of valid frames in it."""
-        return self.autopilot.receive(port, datagram, self._now_us)
+        return self.autopilot.receive(port, datagram, max(self._now_us - self._boot_us, 0))
 
     def step(self, now_us: int) -> None:
         """Fly from the last step to `now_us`, one control period later, and say what is to be said there."""
-        autopilot, simulation = self.autopilot, self.simulation
         first = self._now_us < 0
         self._now_us = now_us
-        if not first:
+        if self.autopilot.reboot_requested and not self._lockstep:
+            self._reboot(now_us)
+        autopilot, simulation = self.autopilot, self.simulation
+        now_us -= self._boot_us
+        if not first and now_us:
             simulation.held[0] = autopilot.held
             setpoint = autopilot.decide(now_us - self.period_us)
             simulation.set_demand(0, self._inner_law(setpoint))
             released_us = autopilot.released_us
             flown_s = -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
             simulation.advance(flown_s)
-        estimate = simulation.estimate[:, 0].tolist()
-        autopilot.estimate = estimate
-        wind = simulation.wind[:, 0].tolist()
-        autopilot.true_wind = (wind[0], wind[1], wind[2])
+        autopilot.estimate = simulation.estimate[:, 0].tolist()
         autopilot.observe(now_us)
         autopilot.report(now_us)
-        self._record.write(now_us, self)
+        self._record.write(self._now_us, self)
+        for store in self._stores:
+            store.step(self._now_us)
         if autopilot.released_us is not None and not autopilot.commander.armed:
             self._done = True
             self._after_flight()
+
+    def close(self) -> None:
+        """Write what is not written yet and close the files that clients had open."""
+        for store in self._stores:
+            store.close()
+        for port in self.autopilot.ports:
+            port.close()
 
     def _after_flight(self) -> None:
         """Ready for the next: where the flight began in a clamp, the clamp takes the vehicle back."""
         if self._flight.scenario.start.clamp:
             self.simulation.put_back()
-            self.autopilot.held = True
-            self.autopilot.landed_state = mavlink.MAV_LANDED_STATE_ON_GROUND
-        if self.autopilot.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND:
+            self.autopilot.put_back()
+        if self.autopilot.on_ground:
             self.autopilot.released_us = None
+
+    def _reboot(self, now_us: int) -> None:
+        """PREFLIGHT_REBOOT_SHUTDOWN: clock, links and autopilot begin anew; the vehicle stays where it stands."""
+        old = self.autopilot
+        self._boot_us = now_us
+        self.autopilot = self._boot(now_us)
+        self.autopilot.held = old.held
+        for port in old.ports:
+            port.close()
+
+    def _on_parameter(self, name: str, value: float) -> None:
+        self.simulation.set_parameter(name)
+        if name.startswith(("BAT", "SIM_BAT")):
+            self.autopilot.battery.settings = battery_settings(self.parameters)
 
     def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
         """What goes out on a link: one message a datagram, or all of a tick in one (`combine`)."""
         return self.autopilot.ports[port].node.datagrams(combine=combine)
 
     def _inner_law(self, setpoint: Setpoint | None) -> Setpoint | None:
-        """With the PIDNN aboard, an attitude setpoint becomes a torque by it; all else passes."""
+        """With the PIDNN aboard, an off-board attitude becomes a torque by it; all else passes."""
         law = self._seated
         if (
             law is None
@@ -135,6 +218,43 @@ class Vehicle:
         if self.autopilot.released_us is None:
             law.reset()
         return law.update(setpoint, self.autopilot.setpoint_us or 0, self.simulation.estimate[:, 0])
+
+
+class _Body:
+    """The simulation as the autopilot's telemetry looks at it."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+
+    @property
+    def truth(self) -> Sequence[float]:
+        truth: list[float] = self._simulation.x[:, 0].tolist()
+        return truth
+
+    @property
+    def true_wind(self) -> Vector:
+        x, y, z = self._simulation.wind[:, 0].tolist()
+        return x, y, z
+
+    @property
+    def rotor_speeds_rad_s(self) -> Sequence[float]:
+        speeds: list[float] = self._simulation.x[13:17, 0].tolist()
+        return speeds
+
+    @property
+    def outputs(self) -> Sequence[float]:
+        largest = self._simulation.gains[tick.MAX_ROTOR_SPEED]
+        shares: list[float] = (self._simulation.x[13:17, 0] / largest).tolist()
+        return shares
+
+    @property
+    def specific_force_flu_m_s2(self) -> Vector:
+        return self._simulation.specific_force(0)
+
+    @property
+    def rate_setpoint_flu_rad_s(self) -> Vector:
+        p, q, r = self._simulation.inner[tick.RATE_SETPOINT : tick.RATE_SETPOINT + 3, 0].tolist()
+        return p, q, r
 
 
 _STATE_MESSAGES = {

@@ -1,245 +1,560 @@
-"""One autopilot: MAVLink in, decisions, MAVLink out. It sees the vehicle by `estimate` and acts by `Demand`."""
+"""One autopilot: MAVLink in, decisions, MAVLink out. It sees the vehicle by `estimate` and acts by a `Setpoint`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from math import hypot
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from math import hypot, inf, isfinite, nan, radians
+from typing import Protocol
 
-from mavsitl.codec import Message
+from mavsitl.codec import Frame, Message
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector
-from mavsitl.node import Node
-from mavsitl.quaternion import to_euler
+from mavsitl.geodesy import Origin
+from mavsitl.routing import Router
 from mavsitl.scenario import Flight
-from mavsitl.services.command import Command, CommandServer
-from mavsitl_vehicle.autopilot import commander as commanding
-from mavsitl_vehicle.autopilot import modes, setpoints, telemetry
+from mavsitl.services.mission import FENCE, MISSION
+from mavsitl.services.statustext import TextLimiter, chunks
+from mavsitl_vehicle.autopilot import commands, modes, plan, setpoints, telemetry
+from mavsitl_vehicle.autopilot.battery import Battery, Level
+from mavsitl_vehicle.autopilot.battery import settings as battery_settings
 from mavsitl_vehicle.autopilot.commander import Commander, Situation
-from mavsitl_vehicle.autopilot.modes import Mode
+from mavsitl_vehicle.autopilot.course import MissionCourse
+from mavsitl_vehicle.autopilot.fence import NO_LIMITS, Fence, FenceLimits
+from mavsitl_vehicle.autopilot.health import Health, summary
+from mavsitl_vehicle.autopilot.modes import Control, Mode
+from mavsitl_vehicle.autopilot.navigator import Navigator
 from mavsitl_vehicle.autopilot.parameters import Parameters
+from mavsitl_vehicle.autopilot.pilot import Pilot
+from mavsitl_vehicle.autopilot.plan import FeasibilityContext
+from mavsitl_vehicle.autopilot.ports import Port, Shared
 from mavsitl_vehicle.autopilot.position import PositionControl
-from mavsitl_vehicle.autopilot.setpoints import Refusal, Setpoint
-
-COMPONENT_ID = mavlink.MAV_COMP_ID_AUTOPILOT1
+from mavsitl_vehicle.autopilot.setpoints import (
+    AttitudeSetpoint,
+    PositionSetpoint,
+    RateSetpoint,
+    Refusal,
+    Setpoint,
+    State,
+)  # fmt: skip
+from mavsitl_vehicle.autopilot.sticks import Axes
+from mavsitl_vehicle.autopilot.telemetry import AttitudeTarget, FlightTimes, Home
 
 TAKEOFF_THRUST_SHARE = 0.9
 """Of the hover thrust: above it, a spooled-up vehicle on the ground counts as taking off."""
+LOW_THRUST_SHARE = 0.5
+"""Of the hover thrust: below it, a vehicle that rests on the ground has landed, whatever its mode."""
 LANDED_HEIGHT_M = 0.05
 LANDED_SPEED_M_S = 0.15
 AIRBORNE_HEIGHT_M = 0.15
 LANDING_TIME_US = 300_000
 LANDING_FILTER_S = 0.3
+LIFT_MARGIN_M = 0.1
+"""An off-board position so far above the vehicle asks to leave the ground."""
+HOUSEKEEPING_US = 100_000
+"""Battery, fence, health: what needs no control period."""
 
-REFUSAL_TEXT_INTERVAL_US = 1_000_000
-"""At most one STATUSTEXT on refused setpoints in this time: a bad stream must not flood its own link."""
+ON_GROUND: int = mavlink.MAV_LANDED_STATE_ON_GROUND
+IN_AIR: int = mavlink.MAV_LANDED_STATE_IN_AIR
+TAKING_OFF: int = mavlink.MAV_LANDED_STATE_TAKEOFF
+LANDING: int = mavlink.MAV_LANDED_STATE_LANDING
 
 
-class Port(NamedTuple):
-    """One link of the autopilot: its MAVLink endpoint and its telemetry schedule."""
+class Body(Protocol):
+    """What the autopilot reads of the simulated vehicle besides its estimate; looked at only where it is sent."""
 
-    name: str
-    node: Node
-    schedule: telemetry.Schedule
+    @property
+    def truth(self) -> Sequence[float]: ...
+    @property
+    def true_wind(self) -> Vector: ...
+    @property
+    def outputs(self) -> Sequence[float]: ...
+    @property
+    def rotor_speeds_rad_s(self) -> Sequence[float]: ...
+    @property
+    def specific_force_flu_m_s2(self) -> Vector: ...
+    @property
+    def rate_setpoint_flu_rad_s(self) -> Vector: ...
 
 
 class Autopilot:
-    """Sans-IO. `receive` datagrams, `decide` once a tick before the physics, `report` once a tick after it."""
+    """Sans-IO. `receive` datagrams, `decide` once a tick before the physics, `observe` and `report` after it."""
 
-    def __init__(self, flight: Flight, system_id: int, port_names: Sequence[str]) -> None:
+    def __init__(
+        self,
+        flight: Flight,
+        system_id: int,
+        port_names: Sequence[str],
+        parameters: Parameters,
+        body: Body,
+        shared: Shared,
+        *,
+        lockstep: bool = False,
+        unix_boot_us: int = 0,
+    ) -> None:
         scenario, airframe = flight.scenario, flight.airframe
         self.system_id = system_id
-        self.parameters = Parameters(airframe.parameters, scenario.parameters)
-        self.commander = Commander(self.parameters, self._queue_text)
-        self.ports = tuple(
-            Port(name, Node(system_id, COMPONENT_ID), telemetry.Schedule(offboard=name == "offboard"))
-            for name in port_names
-        )
-        self.estimate: list[float] = [0.0] * 13
+        self.unix_boot_us = unix_boot_us
+        self.load = 0.0
+        self.parameters = parameters
+        self.body = body
+        self.plan = shared.plan
+        self.metadata = None
+        """The dialect has no COMPONENT_METADATA."""
+        self.commander = Commander(parameters, self.queue_text)
+        self.estimate: list[float] = [0.0] * 6 + [1.0] + [0.0] * 6
         """Position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s: what telemetry says."""
-        self.true_wind: Vector = (0.0, 0.0, 0.0)
-        self.landed_state: int = mavlink.MAV_LANDED_STATE_ON_GROUND
-        self.held = scenario.start.clamp
+        self.accuracy = telemetry.accuracy(scenario.noise)
+        start = scenario.start
+        self.origin = Origin(start.latitude_deg, start.longitude_deg, start.altitude_amsl_m)
+        self.home: Home | None = None
+        self.battery = Battery(airframe, battery_settings(parameters))
+        self.held = start.clamp
         self.released_us: int | None = None
         """When the clamp opened or the take-off began; the flight's time zero."""
-        self.setpoint: Setpoint | None = None
+        self.setpoint: Setpoint | PositionSetpoint | None = None
+        """The newest off-board one."""
         self.setpoint_us: int | None = None
         self.token_us = -1
         """Stamp of the newest off-board setpoint, refused ones included: what lock-step waits for."""
         self.refused_setpoints = 0
-        self.foreign_messages = 0
+        self.reboot_requested = False
+        self.flight_times = FlightTimes()
+        self.health = Health()
+        self.attitude_setpoint: Setpoint | None = None
+        """What the inner loops follow."""
+        self.position_setpoint: PositionSetpoint | None = None
+        self.lockstep = lockstep
         self._hover_thrust = 1.0 / airframe.thrust_to_weight
+        self._gravity = airframe.gravity_m_s2
         period_s = scenario.rates.control_period_us / 1e6
-        self._position_control = PositionControl(self.parameters, airframe.gravity_m_s2, self._hover_thrust, period_s)
-        self._position_mode: Mode | None = None
-        self._texts: list[tuple[int, int, str]] = []
-        """(id that joins its chunks, MAV_SEVERITY, text)"""
+        self._position_control = PositionControl(parameters, self._gravity, self._hover_thrust, period_s)
+        self.navigator = Navigator(
+            parameters, self._gravity, period_s, MissionCourse(shared.plan, parameters, self), self._say
+        )
+        self.pilot = Pilot(parameters, self._gravity, self._hover_thrust, period_s)
+        self._landed_state = ON_GROUND
+        self._flown: Mode | None = None
+        """The mode flown in the last period; None: disarmed."""
+        self._cascade = False
+        """The position cascade flew in the last period."""
+        self._lift_us: int | None = None
+        self._texts: list[Message] = []
         self._text_id = 0
-        self._refusal_text_us = -REFUSAL_TEXT_INTERVAL_US
+        self._limiter = TextLimiter()
+        self._now_us = 0
         self._shown: tuple[Mode, bool, bool, int] | None = None
         self._still_since_us: int | None = None
         self._smooth = (0.0, 0.0, 0.0, 0.0)
         """Height and velocity for the landing detector, with the sensors' noise filtered out."""
         self._smoothing = min(period_s / LANDING_FILTER_S, 1.0)
-        self._commands = CommandServer(self._execute)
-        self._handlers: dict[int, Callable[[Any, int, int], None]] = {
+        self._gcs_us: int | None = None
+        self._housekept_us = -HOUSEKEEPING_US
+        self.mission_refusal: str | None = "no mission"
+        self._fence_breach: str | None = None
+        self._fence = Fence((), self.origin)
+        self._fence_id = 0
+        self._mission_seen: tuple[object, ...] = ()
+        self._mission_told = 0
+        self._router = Router(len(port_names), (system_id, mavlink.MAV_COMP_ID_AUTOPILOT1))
+        self.ports = tuple(Port(name, index, self, shared, lockstep=lockstep) for index, name in enumerate(port_names))
+        self._handlers = {
             mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: self._on_attitude_target,
+            mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: self._on_position_target_local_ned,
+            mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT: self._on_position_target_global_int,
             mavlink.MAVLINK_MSG_ID_SET_ACTUATOR_CONTROL_TARGET: self._on_actuator_control_target,
+            mavlink.MAVLINK_MSG_ID_MANUAL_CONTROL: self._on_manual_control,
             mavlink.MAVLINK_MSG_ID_SET_MODE: self._on_set_mode,
+            mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._on_heartbeat,
+            mavlink.MAVLINK_MSG_ID_SET_GPS_GLOBAL_ORIGIN: self._on_set_origin,
         }
-        self._execution: dict[int, Callable[[Command, int, Port], int]] = {
-            mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
-            mavlink.MAV_CMD_DO_SET_MODE: self._do_set_mode,
-            mavlink.MAV_CMD_NAV_LAND: self._nav_land,
-            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
-            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_message_interval,
-            mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
-            mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_capabilities,
-        }
-        self._command_port = self.ports[0] if self.ports else None
 
     # --- messages in -------------------------------------------------------------------------------------------------
 
     def receive(self, port_index: int, datagram: bytes, now_us: int) -> int:
         """Take one datagram from a link; the number of valid MAVLink frames in it. Never raises on what is in it."""
         port = self.ports[port_index]
-        frames = port.node.receive(datagram)
+        node = port.node
+        frames = node.receive(datagram)
+        self._now_us = now_us
         for frame in frames:
             message = frame.message
-            if type(message).id in (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT):
-                if self._is_ours(port, frame):
-                    self._command_port = port
-                    command, result = self._commands.receive(message, frame.system_id, frame.component_id, now_us)
-                    port.node.send(telemetry.COMMAND_ACK, command, result, 0, 0, frame.system_id, frame.component_id)
-            elif (handler := self._handlers.get(type(message).id)) and self._is_ours(port, frame):
-                handler(message, now_us, frame.system_id)
+            self._router.note(port_index, (frame.system_id, frame.component_id), now_us)
+            if node.addressed_to(frame):
+                handler = self._handlers.get(type(message).id)
+                if handler is not None:
+                    handler(message, frame, now_us)
+                elif not port.receive(message, (frame.system_id, frame.component_id), now_us):
+                    node.counters.unsupported += 1
+            if len(self.ports) > 1:
+                for other in self._router.destinations(port_index, frame, now_us):
+                    self.ports[other].forward(message.get_msgbuf(), now_us)
         return len(frames)
 
-    def _is_ours(self, port: Port, frame: Any) -> bool:
-        if port.node.addressed_to(frame):
-            return True
-        self.foreign_messages += 1
-        return False
-
-    def _on_attitude_target(self, message: Message, now_us: int, system_id: int) -> None:
+    def _on_attitude_target(self, message: Message, frame: Frame, now_us: int) -> None:
         self.token_us = message.time_boot_ms * 1000
         self._take(setpoints.from_attitude_target(message), now_us)
 
-    def _on_actuator_control_target(self, message: Message, now_us: int, system_id: int) -> None:
+    def _on_actuator_control_target(self, message: Message, frame: Frame, now_us: int) -> None:
         self.token_us = message.time_usec
         self._take(setpoints.from_actuator_control_target(message), now_us)
 
-    def _take(self, setpoint: Setpoint | Refusal, now_us: int) -> None:
+    def _on_position_target_local_ned(self, message: Message, frame: Frame, now_us: int) -> None:
+        self.token_us = message.time_boot_ms * 1000
+        self._take(setpoints.from_position_target_local_ned(message, State.of(self.estimate)), now_us)
+
+    def _on_position_target_global_int(self, message: Message, frame: Frame, now_us: int) -> None:
+        self.token_us = message.time_boot_ms * 1000
+        home = self.home_altitude_amsl_m
+        self._take(setpoints.from_position_target_global_int(message, self.origin, home), now_us)
+
+    def _take(self, setpoint: Setpoint | PositionSetpoint | Refusal, now_us: int) -> None:
         if isinstance(setpoint, Refusal):
             self.refused_setpoints += 1
-            if now_us - self._refusal_text_us >= REFUSAL_TEXT_INTERVAL_US:
-                self._refusal_text_us = now_us
-                self._queue_text(mavlink.MAV_SEVERITY_WARNING, setpoint.text)
+            self.warn("setpoint", setpoint.text)
         else:
             self.setpoint, self.setpoint_us = setpoint, now_us
 
-    def _on_set_mode(self, message: Message, now_us: int, system_id: int) -> None:
+    def _on_manual_control(self, message: Message, frame: Frame, now_us: int) -> None:
+        if message.target in (0, self.system_id):
+            self.pilot.receive(message, now_us)
+
+    def _on_set_mode(self, message: Message, frame: Frame, now_us: int) -> None:
         """SET_MODE (11) has no acknowledgement; PX4's main mode is in byte 2, its sub mode in byte 3 of custom_mode."""
-        main_mode, sub_mode = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
-        self._request_mode(main_mode, sub_mode, now_us)
-
-    # --- commands ----------------------------------------------------------------------------------------------------
-
-    def _execute(self, command: Command, now_us: int) -> int:
-        handler = self._execution.get(command.id)
-        if handler is None or self._command_port is None:
-            self._queue_text(mavlink.MAV_SEVERITY_WARNING, f"Command {command.id} is not supported")
-            return commanding.UNSUPPORTED
-        return handler(command, now_us, self._command_port)
-
-    def _deny(self, text: str) -> int:
-        self._queue_text(mavlink.MAV_SEVERITY_WARNING, text)
-        return commanding.DENIED
-
-    def _arm_disarm(self, command: Command, now_us: int, port: Port) -> int:
-        wanted = command.integer(1)
-        if wanted not in (0, 1):
-            return self._deny(f"Arm/disarm refused: param1 is {command.params[0]:g}, need 0 or 1")
-        force = command.integer(2) in commanding.FORCE_MAGIC
-        self._look(now_us)
-        return self.commander.request_arm(wanted == 1, force, now_us)
-
-    def _do_set_mode(self, command: Command, now_us: int, port: Port) -> int:
-        base, main_mode, sub_mode = command.integer(1), command.integer(2), command.integer(3)
-        if base is None or not base & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED or main_mode is None:
-            return self._deny("Mode refused: param1 needs bit 0 (custom mode), param2 PX4's main mode")
-        return self._request_mode(main_mode, sub_mode or 0, now_us)
-
-    def _request_mode(self, main_mode: int, sub_mode: int, now_us: int) -> int:
-        self._look(now_us)
-        return self.commander.request_mode(modes.find(main_mode, sub_mode), f"main {main_mode} sub {sub_mode}")
-
-    def _nav_land(self, command: Command, now_us: int, port: Port) -> int:
-        self._look(now_us)
-        return self.commander.request_mode(Mode.LAND, "land")
-
-    def _set_message_interval(self, command: Command, now_us: int, port: Port) -> int:
-        message_id, interval_us = command.integer(1), command.integer(2)
-        if message_id not in telemetry.BY_ID:
-            return self._deny(f"Message interval refused: no stream of message {command.params[0]:g}")
-        if interval_us is None or not -1 <= interval_us <= telemetry.MAX_INTERVAL_US:
-            return self._deny(
-                f"Message interval refused: {command.params[1]:g} us, need -1 to {telemetry.MAX_INTERVAL_US}"
-            )
-        if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT and interval_us != 0:
-            return self._deny("Message interval refused: HEARTBEAT stays at its rate")
-        if interval_us == -1:
-            port.schedule.set_interval(message_id, telemetry.NEVER, now_us)
+        if message.base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            main_mode, sub_mode = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
+            self.request_mode(modes.find(main_mode, sub_mode), f"main {main_mode} sub {sub_mode}", now_us)
         else:
-            port.schedule.set_interval(message_id, interval_us or port.schedule.default_us(message_id), now_us)
-        return commanding.ACCEPTED
+            self.request_mode(modes.from_base_mode(message.base_mode), f"base mode {message.base_mode}", now_us)
 
-    def _get_message_interval(self, command: Command, now_us: int, port: Port) -> int:
-        message_id = command.integer(1)
-        if message_id is None or not 0 <= message_id <= 65535:
-            return self._deny(f"Message interval refused: no message {command.params[0]:g}")
-        if message_id in telemetry.BY_ID:
-            interval_us = port.schedule.interval_us(message_id) or -1
-        else:
-            interval_us = 0  # MAVLink: not available
-        port.node.send(telemetry.MESSAGE_INTERVAL, message_id, interval_us)
-        return commanding.ACCEPTED
+    def _on_heartbeat(self, message: Message, frame: Frame, now_us: int) -> None:
+        if message.type == mavlink.MAV_TYPE_GCS:
+            self._gcs_us = now_us
 
-    def _request_message(self, command: Command, now_us: int, port: Port) -> int:
-        message_id = command.integer(1)
-        if message_id not in telemetry.BY_ID:
-            return self._deny(f"Request refused: message {command.params[0]:g} is not served")
-        telemetry.BY_ID[message_id].send(self, port.node, now_us)
-        return commanding.ACCEPTED
+    def _on_set_origin(self, message: Message, frame: Frame, now_us: int) -> None:
+        """As on PX4 the origin of a vehicle with GPS is the GPS's: said, not changed."""
+        self.warn("origin", "Origin refused: it is the simulator's")
 
-    def _request_capabilities(self, command: Command, now_us: int, port: Port) -> int:
-        telemetry.send_autopilot_version(self, port.node, now_us)
-        return commanding.ACCEPTED
+    # --- what commands need ------------------------------------------------------------------------------------------
+
+    @property
+    def on_ground(self) -> bool:
+        return self._landed_state == ON_GROUND
+
+    @property
+    def altitude_amsl_m(self) -> float:
+        return self.origin.altitude_amsl_m + self.estimate[2]
+
+    @property
+    def home_altitude_amsl_m(self) -> float:
+        home_height = 0.0 if self.home is None else self.home.position_nwu_m[2]
+        return self.origin.altitude_amsl_m + home_height
+
+    @property
+    def ground_altitude_amsl_m(self) -> float:
+        """Of the ground it stands on or took off from: flat."""
+        return self.origin.altitude_amsl_m
+
+    def height_of(self, altitude_amsl_m: float) -> float:
+        """Above the local origin; NaN stays."""
+        return altitude_amsl_m - self.origin.altitude_amsl_m
+
+    def local_of(self, where: commands.Place) -> tuple[float, float]:
+        return self.origin.to_local(where.latitude_deg, where.longitude_deg)
+
+    def local_at(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        return self.origin.to_local(latitude_deg, longitude_deg)
+
+    def breach_at(self, x_m: float, y_m: float, z_m: float) -> str | None:
+        """Why the fence would not allow this position (NaN: the vehicle's); None where it would, or acts not at all."""
+        if self.parameters["GF_ACTION"] <= 0:
+            return None
+        x, y, z = (a if isfinite(a) else b for a, b in zip((x_m, y_m, z_m), self.estimate[:3], strict=True))
+        return self._breach(x, y, z)
+
+    def request_mode(self, mode: Mode | None, described: str, now_us: int) -> int:
+        self.look(now_us)
+        return self.commander.request_mode(mode, described)
+
+    def jump_to(self, sequence: int) -> bool:
+        return self.plan.jump_to(sequence)
+
+    def set_home_here(self) -> None:
+        x, y, z = self.estimate[:3]
+        self._set_home((x, y, z), State.of(self.estimate).yaw_rad)
+
+    def set_home(self, latitude_deg: float, longitude_deg: float, altitude_amsl_m: float, yaw_deg: float) -> None:
+        """`yaw_deg` clockwise from north; NaN: the heading it has."""
+        x, y = self.origin.to_local(latitude_deg, longitude_deg)
+        yaw = -radians(yaw_deg) if isfinite(yaw_deg) else State.of(self.estimate).yaw_rad
+        self._set_home((x, y, self.height_of(altitude_amsl_m)), yaw)
+
+    def _set_home(self, position_nwu_m: Vector, yaw_rad: float) -> None:
+        self.home = self.navigator.home = Home(position_nwu_m, yaw_rad, self._now_us)
+        self.commander.home_set = True
+        for port in self.ports if not self.lockstep else ():
+            telemetry.request(self, port.node, mavlink.MAVLINK_MSG_ID_HOME_POSITION, 0, self._now_us)
+
+    # --- texts -------------------------------------------------------------------------------------------------------
+
+    def queue_text(self, severity: int, text: str) -> None:
+        """A STATUSTEXT for every link."""
+        self._text_id = self._text_id % 65535 + 1
+        self._texts += chunks(severity, text, self._text_id)
+
+    def warn(self, reason: str, text: str) -> None:
+        """A warning that a hostile or broken peer may cause: each reason speaks at a bounded rate."""
+        admitted = self._limiter.admit(reason, text, self._now_us)
+        if admitted is not None:
+            self.queue_text(mavlink.MAV_SEVERITY_WARNING, admitted)
+
+    def warn_parameter(self, text: str) -> None:
+        """A refused parameter; the server limits the rate."""
+        self.queue_text(mavlink.MAV_SEVERITY_WARNING, text)
+
+    def _say(self, text: str) -> None:
+        self.queue_text(mavlink.MAV_SEVERITY_INFO, text)
+
+    # --- what telemetry shows ----------------------------------------------------------------------------------------
+
+    @property
+    def landed_state(self) -> int:
+        """MAV_LANDED_STATE: in the air, with what the vehicle itself is about."""
+        state = self._landed_state
+        if state == IN_AIR:
+            if self.navigator.landing:
+                return LANDING
+            if self.commander.mode is Mode.TAKEOFF:
+                return TAKING_OFF
+        return state
+
+    @property
+    def true_wind(self) -> Vector:
+        return self.body.true_wind
+
+    @property
+    def truth(self) -> Sequence[float]:
+        return self.body.truth
+
+    @property
+    def outputs(self) -> Sequence[float]:
+        return self.body.outputs
+
+    @property
+    def specific_force_flu_m_s2(self) -> Vector:
+        return self.body.specific_force_flu_m_s2
+
+    @property
+    def attitude_target(self) -> AttitudeTarget | None:
+        setpoint = self.attitude_setpoint
+        if isinstance(setpoint, AttitudeSetpoint):
+            return AttitudeTarget(setpoint.attitude, self.body.rate_setpoint_flu_rad_s, setpoint.thrust)
+        if isinstance(setpoint, RateSetpoint):
+            return AttitudeTarget(None, setpoint.omega_flu_rad_s, setpoint.thrust)
+        return None
+
+    @property
+    def position_target(self) -> PositionSetpoint | None:
+        return self.position_setpoint
+
+    @property
+    def wind(self) -> None:
+        """Not estimated aboard."""
+        return
+
+    @property
+    def sticks(self) -> Axes | None:
+        return self.pilot.axes if self.commander.sticks_fresh() else None
+
+    @property
+    def mission(self) -> telemetry.Mission:
+        status = self.plan.status()
+        return telemetry.Mission(status.seq, status.total, status.state, status.mode == 1)
 
     # --- a tick ------------------------------------------------------------------------------------------------------
 
+    def look(self, now_us: int) -> None:
+        """Step the commander with what is known now."""
+        self._now_us = now_us
+        setpoint_us, sticks_us, gcs_us = self.setpoint_us, self.pilot.received_us, self._gcs_us
+        was_armed = self.commander.armed
+        self.commander.step(
+            now_us,
+            Situation(
+                self._landed_state == ON_GROUND,
+                None if setpoint_us is None else now_us - setpoint_us,
+                None if sticks_us is None else now_us - sticks_us,
+                None if gcs_us is None else now_us - gcs_us,
+                self.mission_refusal,
+                None if was_armed else summary(self.health),
+                int(self.battery.level),
+                self._fence_breach,
+            ),
+        )
+
     def decide(self, now_us: int) -> Setpoint | None:
         """Before the physics: step the commander, and the setpoint for the inner loops; None stops the rotors."""
-        self._look(now_us)
+        if now_us - self._housekept_us >= HOUSEKEEPING_US or now_us < self._housekept_us:
+            self._keep_house(now_us)
+        self.look(now_us)
         commander = self.commander
         if not commander.armed:
-            self._position_mode = None
+            if self._flown is not None:
+                self._stand_down(now_us)
             return None
-        on_ground = self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
-        if commander.mode is Mode.OFFBOARD:
-            self._position_mode = None
-            waiting = on_ground and not self.held and not commander.spooled_up(now_us)
-            return None if waiting else self.setpoint
-        if on_ground:
-            self._position_mode = None
+        mode = commander.mode
+        if mode is not self._flown:
+            self._switch(mode, now_us)
+        control = modes.TABLE[mode].control
+        if control is Control.STREAM:
+            setpoint = self._follow_stream(now_us)
+        elif control is Control.NAVIGATOR:
+            setpoint = self._navigate(now_us)
+        elif control is Control.STICKS:
+            setpoint = self._fly_by_sticks(mode, now_us)
+        else:
+            setpoint = None
+        self.attitude_setpoint = setpoint
+        return setpoint
+
+    def _follow_stream(self, now_us: int) -> Setpoint | None:
+        setpoint = self.setpoint
+        on_ground = self._landed_state == ON_GROUND
+        if on_ground and not self.held and not self.commander.spooled_up(now_us):
             return None
-        e = self.estimate
-        if self._position_mode is not commander.mode:
-            _, _, yaw_rad = to_euler((e[6], e[7], e[8], e[9]))
-            self._position_control.engage((e[0], e[1], e[2]), yaw_rad, afresh=self._position_mode is None)
-            self._position_mode = commander.mode
-        descend = commander.mode is Mode.LAND
-        return self._position_control.update((e[0], e[1], e[2]), (e[3], e[4], e[5]), descend)
+        if not isinstance(setpoint, PositionSetpoint):
+            self._cascade = False
+            self.position_setpoint = None
+            return setpoint
+        state = State.of(self.estimate)
+        if on_ground and not _asks_to_lift(setpoint, state):
+            self._rest()
+            return None
+        return self._fly_position(setpoint, state, inf)
+
+    def _navigate(self, now_us: int) -> Setpoint | None:
+        state = State.of(self.estimate)
+        on_ground = self._landed_state == ON_GROUND
+        if on_ground and not (self.commander.spooled_up(now_us) and self.navigator.wants_lift()):
+            self._rest()
+            return None
+        target, climb_limit = self.navigator.update(state, now_us)
+        finished = self.navigator.finished
+        if finished is Mode.TAKEOFF:
+            self.commander.complete(Mode.TAKEOFF, Mode.LOITER)
+        return self._fly_position(target, state, climb_limit)
+
+    def _fly_by_sticks(self, mode: Mode, now_us: int) -> Setpoint | None:
+        present = self.commander.sticks_fresh()
+        if self._landed_state == ON_GROUND:
+            lift = present and self.pilot.wants_lift(mode)
+            if not (lift and self.commander.spooled_up(now_us)):
+                self._rest()
+                return None
+        state = State.of(self.estimate)
+        setpoint = self.pilot.update(mode, state, state.position_nwu_m[2], present=present)
+        if isinstance(setpoint, PositionSetpoint):
+            return self._fly_position(setpoint, state, inf)
+        self._cascade = False
+        self.position_setpoint = None
+        return setpoint
+
+    def _fly_position(self, target: PositionSetpoint, state: State, climb_limit_m_s: float) -> AttitudeSetpoint:
+        if not self._cascade:
+            flown = self.attitude_setpoint
+            self._position_control.engage(flown if isinstance(flown, AttitudeSetpoint) else None)
+            self._cascade = True
+        self.position_setpoint = target
+        return self._position_control.update(target, state, climb_limit_m_s)
+
+    def _rest(self) -> None:
+        """On the ground: rotors still, nothing integrates."""
+        self._position_control.reset()
+        self._cascade = False
+        self.position_setpoint = None
+
+    def _switch(self, mode: Mode, now_us: int) -> None:
+        """Another mode flies from now on."""
+        state = State.of(self.estimate)
+        control = modes.TABLE[mode].control
+        if self._flown is None:
+            self._arm(now_us)
+        self._flown = mode
+        if control is Control.NAVIGATOR:
+            acceleration = self._position_control.acceleration_setpoint_nwu_m_s2 if self._cascade else (0.0, 0.0, 0.0)
+            self.navigator.enter(mode, state, acceleration, self.on_ground, now_us)
+        else:
+            self.navigator.leave()
+            if control is Control.STICKS:
+                self.pilot.engage(mode, state)
+
+    def _arm(self, now_us: int) -> None:
+        self.set_home_here()
+        self.flight_times = FlightTimes(max(now_us, 1), 0, 0, self.flight_times.number + 1)
+
+    def _stand_down(self, now_us: int) -> None:
+        self._flown = None
+        self.attitude_setpoint = self.position_setpoint = None
+        self._rest()
+        self.navigator.leave()
+        self.flight_times = self.flight_times._replace(landed_us=max(now_us, 1))
+
+    def _keep_house(self, now_us: int) -> None:
+        """What is looked at ten times a second: battery, fence, mission, health."""
+        self._housekept_us = now_us
+        parameters, armed = self.parameters, self.commander.armed
+        if self.home is None:
+            self.set_home_here()
+        self.battery.update(self.body.rotor_speeds_rad_s, armed, HOUSEKEEPING_US / 1e6)
+        self._refresh_plan()
+        self._fence_breach = self._breach(*self.estimate[:3])
+        mode = modes.TABLE[self.commander.intended]
+        self.health = Health(
+            battery=self.battery.level < Level.CRITICAL,
+            home=self.home is not None,
+            sticks=self.commander.sticks_fresh(),
+            fence=bool(self._fence) and parameters["GF_ACTION"] > 0,
+            fence_breached=self._fence_breach is not None and parameters["GF_ACTION"] > 0,
+            position_needed=mode.control is not Control.STREAM,
+            mode_refusal=None,
+        )
+
+    def _refresh_plan(self) -> None:
+        """The fence on the local plane, and whether the mission could be flown; looked at when something changed."""
+        stores, p = self.plan.stores, self.parameters
+        fence_id = stores.id(FENCE)
+        if fence_id != self._fence_id:
+            self._fence_id = fence_id
+            self._fence = self.plan.fence(self.origin)
+        limits = FenceLimits(p["GF_MAX_HOR_DIST"], p["GF_MAX_VER_DIST"]) if p["GF_ACTION"] > 0 else NO_LIMITS
+        seen = (stores.id(MISSION), fence_id, limits, self.home, self.on_ground, p["MIS_TKO_LAND_REQ"])
+        if seen == self._mission_seen:
+            return
+        self._mission_seen = seen
+        context = FeasibilityContext(
+            self.on_ground, self._global_home(), self.origin, self._fence if p["GF_ACTION"] > 0 else None, limits,
+            p["MIS_DIST_1WP"], int(p["MIS_TKO_LAND_REQ"]), p["MIS_TAKEOFF_ALT"],
+        )  # fmt: skip
+        findings = self.plan.feasibility(context)
+        fatal = next((finding.text for finding in findings if finding.fatal), None)
+        if stores.items(MISSION) and stores.id(MISSION) != self._mission_told:
+            self._mission_told = stores.id(MISSION)
+            for finding in findings[:3]:
+                self.warn("mission", f"Mission: {finding.text}")
+        self.mission_refusal = fatal
+
+    def _global_home(self) -> plan.Home | None:
+        if self.home is None:
+            return None
+        x, y, _ = self.home.position_nwu_m
+        return plan.Home(*self.origin.to_global(x, y), self.home_altitude_amsl_m)
+
+    def _breach(self, x_m: float, y_m: float, z_m: float) -> str | None:
+        if self.home is None:
+            return None
+        hx, hy, hz = self.home.position_nwu_m
+        limits = FenceLimits(self.parameters["GF_MAX_HOR_DIST"], self.parameters["GF_MAX_VER_DIST"])
+        breach = self._fence.breach(x_m, y_m, z_m - hz, hx, hy, limits)
+        return None if breach is None else breach.text
 
     def observe(self, now_us: int) -> None:
         """After the physics, with the new estimate: is it on the ground, in the clamp, taking off, in the air?"""
@@ -253,34 +568,42 @@ class Autopilot:
             vz + share * (e[5] - vz),
         )
         if not commander.armed:
-            if self.landed_state != mavlink.MAV_LANDED_STATE_ON_GROUND and not self.held:
+            if self._landed_state != ON_GROUND and not self.held:
                 self._update_landed(now_us)
             return
-        if self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND:
-            thrust = self.setpoint.thrust if self.setpoint is not None else 0.0
-            ready = commander.spooled_up(now_us) and commander.mode is Mode.OFFBOARD
-            if ready and thrust >= TAKEOFF_THRUST_SHARE * self._hover_thrust:
-                self.landed_state = mavlink.MAV_LANDED_STATE_IN_AIR if self.held else mavlink.MAV_LANDED_STATE_TAKEOFF
+        if self._landed_state == ON_GROUND:
+            setpoint = self.attitude_setpoint
+            thrust = setpoint.thrust if setpoint is not None else 0.0
+            if thrust >= TAKEOFF_THRUST_SHARE * self._hover_thrust and commander.spooled_up(now_us):
+                self._landed_state = IN_AIR if self.held else TAKING_OFF
                 self.held = False
                 self.released_us = now_us
                 self._still_since_us = None
+                self.flight_times = self.flight_times._replace(took_off_us=max(now_us, 1))
         else:
             self._update_landed(now_us)
 
     def _update_landed(self, now_us: int) -> None:
         z, vx, vy, vz = self._smooth
         if z > AIRBORNE_HEIGHT_M:
-            self.landed_state = mavlink.MAV_LANDED_STATE_IN_AIR
+            self._landed_state = IN_AIR
             self._still_since_us = None
             return
         still = z < LANDED_HEIGHT_M and abs(vz) < LANDED_SPEED_M_S and hypot(vx, vy) < LANDED_SPEED_M_S
-        landing = self.commander.mode is Mode.LAND or not self.commander.armed
+        setpoint = self.attitude_setpoint
+        unloaded = setpoint is None or setpoint.thrust < LOW_THRUST_SHARE * self._hover_thrust
+        landing = self.navigator.landing or not self.commander.armed or unloaded
         if not (still and landing):
             self._still_since_us = None
         elif self._still_since_us is None:
             self._still_since_us = now_us
         elif now_us - self._still_since_us >= LANDING_TIME_US:
-            self.landed_state = mavlink.MAV_LANDED_STATE_ON_GROUND
+            self._landed_state = ON_GROUND
+
+    def put_back(self) -> None:
+        """The clamp has taken the vehicle again."""
+        self.held = True
+        self._landed_state = ON_GROUND
 
     def report(self, now_us: int) -> None:
         """Telemetry that is due, texts, and at once what changed: HEARTBEAT and EXTENDED_SYS_STATE are pushed."""
@@ -289,18 +612,21 @@ class Autopilot:
         self._shown = shown
         texts, self._texts = self._texts, []
         for port in self.ports:
-            for text_id, severity, text in texts:
-                telemetry.send_text(port.node, severity, text, text_id)
+            node = port.node
+            for text in texts:
+                node.send_message(text)
             if changed:
-                telemetry.send_heartbeat(self, port.node, now_us)
-                telemetry.send_extended_sys_state(self, port.node, now_us)
-            port.schedule.run(self, port.node, now_us)
+                telemetry.send_heartbeat(self, node, now_us)
+                telemetry.send_extended_sys_state(self, node, now_us)
+                if not self.lockstep:
+                    telemetry.send_current_mode(self, node, now_us)
+            port.step(now_us)
+            port.schedule.run(self, node, now_us)
 
-    def _look(self, now_us: int) -> None:
-        age = None if self.setpoint_us is None else now_us - self.setpoint_us
-        landed = self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
-        self.commander.step(now_us, Situation(landed=landed, setpoint_age_us=age))
 
-    def _queue_text(self, severity: int, text: str) -> None:
-        self._text_id = self._text_id % 65535 + 1
-        self._texts.append((self._text_id, severity, text))
+def _asks_to_lift(setpoint: PositionSetpoint, state: State) -> bool:
+    """Off-board on the ground: a height above it, or a climb, asked for."""
+    height, climb, push = setpoint.position_nwu_m[2], setpoint.velocity_nwu_m_s[2], setpoint.acceleration_nwu_m_s2[2]
+    if isfinite(height):
+        return height > state.position_nwu_m[2] + LIFT_MARGIN_M
+    return (climb if isfinite(climb) else push if isfinite(push) else nan) > 0.0

@@ -1,4 +1,4 @@
-"""The flight modes: one table, PX4's numbers. The diagram in the docs is drawn from it."""
+"""The flight modes: one table, PX4's numbers. The list and the diagram in the docs are made from it."""
 
 from __future__ import annotations
 
@@ -9,33 +9,99 @@ from mavsitl.dialect import mavlink
 
 
 class Mode(Enum):
+    MANUAL = auto()
+    ALTCTL = auto()
+    POSCTL = auto()
+    MISSION = auto()
     LOITER = auto()
-    LAND = auto()
+    RTL = auto()
+    ACRO = auto()
+    TERMINATION = auto()
     OFFBOARD = auto()
+    STABILIZED = auto()
+    TAKEOFF = auto()
+    LAND = auto()
+    ORBIT = auto()
+
+
+class Control(Enum):
+    """Who makes a mode's setpoints."""
+
+    STICKS = auto()
+    """MANUAL_CONTROL, see `sticks.py`."""
+    NAVIGATOR = auto()
+    """The vehicle itself, see `navigator.py`."""
+    STREAM = auto()
+    """An off-board program, see `setpoints.py`."""
+    NOBODY = auto()
+    """The rotors stand still."""
 
 
 class ModeInfo(NamedTuple):
+    """PX4's numbers and rules of one mode."""
+
     name: str
+    """As mavros and the log say it."""
+    title: str
+    """AVAILABLE_MODES.mode_name, where the mode is not a standard one; as QGroundControl shows it."""
     main_mode: int
     sub_mode: int
     nav_state: int
     """vehicle_status.nav_state, for the log."""
-    base_mode: int
-    """MAV_MODE_FLAG bits besides CUSTOM_MODE_ENABLED and SAFETY_ARMED."""
+    control: Control
+    standard_mode: int
+    """MAV_STANDARD_MODE"""
+    stabilized: bool
+    """An attitude loop runs: MAV_MODE_FLAG_STABILIZE_ENABLED."""
     can_arm: bool
+    """PX4's mode_req_prevent_arming, inverted."""
+    selectable: bool = True
+    """A user may ask for it; otherwise only a command with its own parameters or a fail-safe leads there."""
+    advanced: bool = True
+    """MAV_MODE_PROPERTY_ADVANCED: not for beginners."""
+
+    @property
+    def base_mode(self) -> int:
+        """MAV_MODE_FLAG bits besides CUSTOM_MODE_ENABLED and SAFETY_ARMED."""
+        flags = mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED if self.stabilized else 0
+        if self.control is Control.STICKS:
+            flags |= mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+        elif self.control in (Control.NAVIGATOR, Control.STREAM):
+            flags |= mavlink.MAV_MODE_FLAG_GUIDED_ENABLED | mavlink.MAV_MODE_FLAG_AUTO_ENABLED
+        return int(flags)
 
 
-_AUTO_FLAGS = (
-    mavlink.MAV_MODE_FLAG_AUTO_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED | mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
-)
+def _row(
+    name: str, title: str, numbers: tuple[int, int, int], control: Control, *, standard: int = 0, can_arm: bool = True,
+    stabilized: bool = True, selectable: bool = True, advanced: bool = True,
+) -> ModeInfo:  # fmt: skip
+    return ModeInfo(name, title, *numbers, control, standard, stabilized, can_arm, selectable, advanced)
+
+
+_STICKS, _AUTO = Control.STICKS, Control.NAVIGATOR
 
 TABLE: dict[Mode, ModeInfo] = {
-    Mode.LOITER: ModeInfo("AUTO.LOITER", 4, 3, 4, _AUTO_FLAGS, True),
-    Mode.LAND: ModeInfo("AUTO.LAND", 4, 6, 18, _AUTO_FLAGS, False),
-    Mode.OFFBOARD: ModeInfo("OFFBOARD", 6, 0, 14, _AUTO_FLAGS, True),
+    Mode.MANUAL: _row("MANUAL", "Manual", (1, 0, 0), _STICKS),
+    Mode.ALTCTL: _row("ALTCTL", "Altitude", (2, 0, 1), _STICKS, standard=4, advanced=False),
+    Mode.POSCTL: _row("POSCTL", "Position", (3, 0, 2), _STICKS, standard=1, advanced=False),
+    Mode.MISSION: _row("AUTO.MISSION", "Mission", (4, 4, 3), _AUTO, standard=6, advanced=False),
+    Mode.LOITER: _row("AUTO.LOITER", "Hold", (4, 3, 4), _AUTO, advanced=False),
+    Mode.RTL: _row("AUTO.RTL", "Return", (4, 5, 5), _AUTO, standard=5, can_arm=False, advanced=False),
+    Mode.ACRO: _row("ACRO", "Acro", (5, 0, 10), _STICKS, stabilized=False),
+    Mode.TERMINATION: _row(
+        "TERMINATION", "Termination", (10, 0, 13), Control.NOBODY, can_arm=False, stabilized=False, selectable=False
+    ),
+    Mode.OFFBOARD: _row("OFFBOARD", "Offboard", (6, 0, 14), Control.STREAM),
+    Mode.STABILIZED: _row("STABILIZED", "Stabilized", (7, 0, 15), _STICKS),
+    Mode.TAKEOFF: _row("AUTO.TAKEOFF", "Takeoff", (4, 2, 17), _AUTO, standard=8, advanced=False),
+    Mode.LAND: _row("AUTO.LAND", "Land", (4, 6, 18), _AUTO, standard=7, can_arm=False, advanced=False),
+    Mode.ORBIT: _row("ORBIT", "Orbit", (3, 1, 21), _AUTO, standard=2, can_arm=False, selectable=False, advanced=False),
 }
+"""In the order of PX4's nav_state, which is the order of AVAILABLE_MODES."""
 
 _BY_NUMBERS = {(info.main_mode, info.sub_mode): mode for mode, info in TABLE.items()}
+_BY_NUMBERS[4, 0] = Mode.MISSION  # PX4: AUTO without a sub mode
+_BY_STANDARD = {info.standard_mode: mode for mode, info in TABLE.items() if info.standard_mode}
 
 
 def custom_mode(mode: Mode) -> int:
@@ -47,3 +113,19 @@ def custom_mode(mode: Mode) -> int:
 def find(main_mode: int, sub_mode: int) -> Mode | None:
     """The mode that PX4's numbers name, or None where this vehicle has none of that kind."""
     return _BY_NUMBERS.get((main_mode, sub_mode))
+
+
+def find_standard(standard_mode: int) -> Mode | None:
+    """The mode for a MAV_STANDARD_MODE, or None."""
+    return _BY_STANDARD.get(standard_mode)
+
+
+def from_base_mode(base_mode: int) -> Mode | None:
+    """What PX4 makes of MAV_MODE_FLAG bits alone, without the custom bit."""
+    if base_mode & mavlink.MAV_MODE_FLAG_AUTO_ENABLED:
+        return Mode.MISSION
+    if not base_mode & mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:
+        return None
+    if base_mode & mavlink.MAV_MODE_FLAG_GUIDED_ENABLED:
+        return Mode.POSCTL
+    return Mode.STABILIZED if base_mode & mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED else Mode.MANUAL

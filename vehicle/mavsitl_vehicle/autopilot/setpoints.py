@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
-from math import isfinite, nan, sqrt
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from math import atan2, cos, isfinite, nan, pi, remainder, sin, sqrt
+from typing import Any, NamedTuple, Protocol
 
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Quaternion, Vector, flip_quaternion, flip_vector
+from mavsitl.quaternion import rotate
 
 ROLL_RATE_IGNORE = mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
 PITCH_RATE_IGNORE = mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
 YAW_RATE_IGNORE = mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
 THRUST_BODY_SET = 32
-"""ATTITUDE_TARGET_TYPEMASK_THRUST_BODY_SET; the dialect's message has no thrust_body field."""
+"""ATTITUDE_TARGET_TYPEMASK_THRUST_BODY_SET: `thrust_body`, an extension field, in place of `thrust`."""
 THROTTLE_IGNORE = mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE
 ATTITUDE_IGNORE = mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
+
+POSITION_IGNORE = 1, 2, 4
+VELOCITY_IGNORE = 8, 16, 32
+ACCELERATION_IGNORE = 64, 128, 256
+"""POSITION_TARGET_TYPEMASK bits that leave out x, y and z of each group."""
+FORCE_SET = mavlink.POSITION_TARGET_TYPEMASK_FORCE_SET
+YAW_IGNORE = mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+TARGET_YAW_RATE_IGNORE = mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+
+ABOVE_SEA = mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT
+ABOVE_HOME = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
+ABOVE_GROUND = mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT, mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT
+"""What `alt` of SET_POSITION_TARGET_GLOBAL_INT counts from, by frame."""
 
 NORM_TOLERANCE = 0.01
 """How far a setpoint's quaternion may be from unit length; float32 and honest clients stay within 1e-6."""
@@ -43,6 +58,54 @@ class TorqueSetpoint(NamedTuple):
 
 
 Setpoint = AttitudeSetpoint | RateSetpoint | TorqueSetpoint
+"""What the inner loops follow."""
+
+FREE: Vector = (nan, nan, nan)
+"""No axis controlled."""
+
+
+class PositionSetpoint(NamedTuple):
+    """What `PositionControl` follows, in the world (NWU). NaN: that axis of that quantity is not asked for.
+
+    Velocity beside position, and acceleration beside either, are fed forward.
+    """
+
+    position_nwu_m: Vector = FREE
+    velocity_nwu_m_s: Vector = FREE
+    acceleration_nwu_m_s2: Vector = FREE
+    yaw_rad: float = nan
+    yaw_rate_rad_s: float = nan
+
+
+class State(NamedTuple):
+    """What the estimate says of the vehicle; a component that is not finite is not known."""
+
+    position_nwu_m: Vector
+    velocity_nwu_m_s: Vector
+    attitude: Quaternion
+    """Unit, FLU -> NWU."""
+
+    @classmethod
+    def of(cls, estimate: Sequence[float]) -> State:
+        """From an estimate's rows (13,): position m, velocity m/s, quaternion, and rates, which are not looked at."""
+        px, py, pz, vx, vy, vz, w, x, y, z = estimate[:10]
+        return cls((px, py, pz), (vx, vy, vz), (w, x, y, z))
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading, counter-clockwise from north, -pi to pi; NaN where the attitude is not known."""
+        w, x, y, z = self.attitude
+        return atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+
+
+class Origin(Protocol):
+    """Where the local frame stands on the earth."""
+
+    @property
+    def altitude_amsl_m(self) -> float: ...
+
+    def to_local(self, latitude_deg: float, longitude_deg: float, /) -> tuple[float, float]:
+        """(north m, west m)"""
 
 
 class Refusal(NamedTuple):
@@ -55,18 +118,23 @@ def from_attitude_target(message: Any) -> Setpoint | Refusal:
     """SET_ATTITUDE_TARGET, PX4's reading of `type_mask`.
 
     The attitude is used unless ATTITUDE_IGNORE is set, and then a body yaw rate that is not ignored feeds its yaw
-    forward. Otherwise body rates are used if neither roll nor pitch rate is ignored. THROTTLE_IGNORE means zero thrust.
+    forward. Otherwise body rates are used if neither roll nor pitch rate is ignored. THROTTLE_IGNORE means zero thrust;
+    THRUST_BODY_SET takes thrust_body's upward share (-z) for the collective and leaves its x and y.
     Fields that the mask leaves out are not looked at; a used field that is not finite, or a quaternion that is not of
     unit length, refuses the whole message.
     """
     mask: int = message.type_mask
-    if mask & THRUST_BODY_SET:
+    thrust_body = getattr(message, "thrust_body", None) if mask & THRUST_BODY_SET else None
+    if mask & THRUST_BODY_SET and thrust_body is None:
         return Refusal("SET_ATTITUDE_TARGET refused: THRUST_BODY_SET needs thrust_body, not in this dialect")
     use_attitude = not mask & ATTITUDE_IGNORE
     use_rates = not mask & (ROLL_RATE_IGNORE | PITCH_RATE_IGNORE)
     if not use_attitude and not use_rates:
         return Refusal(f"SET_ATTITUDE_TARGET refused: type_mask {mask:#04x} leaves no setpoint")
-    thrust = 0.0 if mask & THROTTLE_IGNORE else message.thrust
+    if mask & THROTTLE_IGNORE:
+        thrust = 0.0
+    else:
+        thrust = message.thrust if thrust_body is None else -thrust_body[2]
     yaw_rate = nan if mask & YAW_RATE_IGNORE else message.body_yaw_rate
     if not isfinite(thrust):
         return Refusal("SET_ATTITUDE_TARGET refused: thrust is not finite")
@@ -95,3 +163,132 @@ def from_actuator_control_target(message: Any) -> Setpoint | Refusal:
         return Refusal("SET_ACTUATOR_CONTROL_TARGET refused: controls are not finite")
     roll, pitch, yaw = (min(max(value, -1.0), 1.0) for value in (roll, pitch, yaw))
     return TorqueSetpoint(flip_vector(roll, pitch, yaw), min(max(thrust, 0.0), 1.0))
+
+
+def from_position_target_local_ned(message: Any, state: State) -> PositionSetpoint | Refusal:
+    """SET_POSITION_TARGET_LOCAL_NED (84), all masks, in four frames.
+
+    LOCAL_NED (1); LOCAL_OFFSET_NED (7): position counts from the present one; BODY_NED (8): PX4's reading, velocity
+    turned by the heading, acceleration by the attitude, position not taken; BODY_OFFSET_NED (9): ArduPilot's reading,
+    position, velocity, acceleration and yaw count from the present position and heading.
+
+    In the turned frames an axis exists only together with the others that it is turned into: of x and y, one that is
+    ignored beside a used one is 0, and BODY_NED takes an acceleration only whole. Refused: other frames, a mask that
+    leaves nothing to hold, FORCE with an acceleration, used fields that are not finite, and an unknown state where the
+    frame needs it.
+    """
+    name = "SET_POSITION_TARGET_LOCAL_NED"
+    mask: int = message.type_mask
+    frame: int = message.coordinate_frame
+    in_body = frame == mavlink.MAV_FRAME_BODY_NED
+    in_body_offset = frame == mavlink.MAV_FRAME_BODY_OFFSET_NED
+    in_offset = frame == mavlink.MAV_FRAME_LOCAL_OFFSET_NED
+    if not (in_body or in_body_offset or in_offset or frame == mavlink.MAV_FRAME_LOCAL_NED):
+        return Refusal(f"{name} refused: coordinate frame {frame} unsupported, need 1, 7, 8 or 9")
+    position = FREE if in_body else _used(mask, POSITION_IGNORE, message.x, message.y, message.z)
+    velocity = _used(mask, VELOCITY_IGNORE, message.vx, message.vy, message.vz)
+    acceleration = _used(mask, ACCELERATION_IGNORE, message.afx, message.afy, message.afz)
+    if in_body and mask & sum(ACCELERATION_IGNORE):
+        acceleration = FREE
+    setpoint = _checked(name, message, mask, position, velocity, acceleration)
+    if isinstance(setpoint, Refusal) or frame == mavlink.MAV_FRAME_LOCAL_NED:
+        return setpoint
+    position, velocity, acceleration, yaw, yaw_rate = setpoint
+    if in_body or in_body_offset:
+        heading = state.yaw_rad
+        if not isfinite(heading):
+            return Refusal(f"{name} refused: frame {frame} needs the heading, and it is not known")
+        c, s = cos(heading), sin(heading)
+        velocity = _turned(velocity, c, s)
+        if in_body:
+            if acceleration is not FREE:
+                acceleration = rotate(state.attitude, acceleration)
+        else:
+            position, acceleration = _turned(position, c, s), _turned(acceleration, c, s)
+            yaw = remainder(heading + yaw, 2.0 * pi)
+    if not in_body:
+        x, y, z = (a + b for a, b in zip(position, state.position_nwu_m, strict=True))
+        if any(isfinite(a) and not isfinite(b) for a, b in zip(position, (x, y, z), strict=True)):
+            return Refusal(f"{name} refused: frame {frame} needs the position, and it is not known")
+        position = (x, y, z)
+    return PositionSetpoint(position, velocity, acceleration, yaw, yaw_rate)
+
+
+def from_position_target_global_int(
+    message: Any, origin: Origin, home_altitude_amsl_m: float
+) -> PositionSetpoint | Refusal:
+    """SET_POSITION_TARGET_GLOBAL_INT (86): altitude above mean sea level in frames 0 and 5, above home in 3 and 6.
+
+    Frames 10 and 11 count from the ground, which is flat at the origin's altitude. Latitude and longitude are used
+    both or not at all; velocity and acceleration are NED. `home_altitude_amsl_m` is NaN where there is no home yet.
+    Refusals as for `from_position_target_local_ned`.
+    """
+    name = "SET_POSITION_TARGET_GLOBAL_INT"
+    mask: int = message.type_mask
+    frame: int = message.coordinate_frame
+    if frame in ABOVE_SEA:
+        datum = 0.0
+    elif frame in ABOVE_HOME:
+        datum = home_altitude_amsl_m
+    elif frame in ABOVE_GROUND:
+        datum = origin.altitude_amsl_m
+    else:
+        return Refusal(f"{name} refused: coordinate frame {frame} unsupported, need 0, 3, 5, 6, 10 or 11")
+    ignored = mask & 3
+    if ignored in (1, 2):
+        return Refusal(f"{name} refused: latitude and longitude are used or ignored together")
+    north = west = up = nan
+    if not ignored:
+        latitude, longitude = message.lat_int / 1e7, message.lon_int / 1e7
+        if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+            return Refusal(f"{name} refused: no place on earth at {latitude:g}, {longitude:g}")
+        north, west = origin.to_local(latitude, longitude)
+    if not mask & POSITION_IGNORE[2]:
+        if not isfinite(datum):
+            return Refusal(f"{name} refused: frame {frame} needs a home position")
+        up = message.alt + datum - origin.altitude_amsl_m
+    velocity = _used(mask, VELOCITY_IGNORE, message.vx, message.vy, message.vz)
+    acceleration = _used(mask, ACCELERATION_IGNORE, message.afx, message.afy, message.afz)
+    return _checked(name, message, mask, (north, -west, -up), velocity, acceleration)
+
+
+def _used(mask: int, bits: tuple[int, int, int], x: float, y: float, z: float) -> Vector:
+    return nan if mask & bits[0] else x, nan if mask & bits[1] else y, nan if mask & bits[2] else z
+
+
+def _checked(
+    name: str, message: Any, mask: int, position: Vector, velocity: Vector, acceleration: Vector
+) -> PositionSetpoint | Refusal:
+    """NED in, NWU out, once all that the mask uses is finite and is something to hold."""
+    groups = []
+    for label, bits, values in (
+        ("position", POSITION_IGNORE, position),
+        ("velocity", VELOCITY_IGNORE, velocity),
+        ("acceleration", ACCELERATION_IGNORE, acceleration),
+    ):
+        if values is FREE or all(mask & bit for bit in bits):
+            groups.append(FREE)
+        elif all(mask & bit or isfinite(value) for bit, value in zip(bits, values, strict=True)):
+            groups.append(flip_vector(*values))
+        else:
+            return Refusal(f"{name} refused: {label} is not finite")
+    if all(group is FREE for group in groups):
+        return Refusal(f"{name} refused: type_mask {mask:#05x} leaves no position, velocity or acceleration")
+    if mask & FORCE_SET and groups[2] is not FREE:
+        return Refusal(f"{name} refused: FORCE is not supported")
+    yaw = nan if mask & YAW_IGNORE else -message.yaw
+    yaw_rate = nan if mask & TARGET_YAW_RATE_IGNORE else -message.yaw_rate
+    if not (mask & YAW_IGNORE or isfinite(yaw)):
+        return Refusal(f"{name} refused: yaw is not finite")
+    if not (mask & TARGET_YAW_RATE_IGNORE or isfinite(yaw_rate)):
+        return Refusal(f"{name} refused: yaw_rate is not finite")
+    return PositionSetpoint(groups[0], groups[1], groups[2], remainder(yaw, 2.0 * pi), yaw_rate)
+
+
+def _turned(vector: Vector, c: float, s: float) -> Vector:
+    """From the heading's axes to the world's; of x and y, the one left out beside a used one is 0."""
+    x, y, z = vector
+    if not (isfinite(x) or isfinite(y)):
+        return vector
+    x, y = x if isfinite(x) else 0.0, y if isfinite(y) else 0.0
+    return c * x - s * y, s * x + c * y, z

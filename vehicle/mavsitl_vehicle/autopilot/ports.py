@@ -1,0 +1,145 @@
+"""The autopilot's links: on each a MAVLink endpoint, its telemetry schedule and the server halves of the services."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavsitl.codec import Message
+from mavsitl.dialect import mavlink
+from mavsitl.node import Node
+from mavsitl.services.base import Peer, Service
+from mavsitl.services.bucket import TokenBucket
+from mavsitl.services.command import Command, CommandServer
+from mavsitl.services.files import FileTree, Folder, MemoryFiles, Mounts, Quota
+from mavsitl.services.ftp import FtpServer
+from mavsitl.services.log_transfer import LogServer, TreeLogs
+from mavsitl.services.mission import MissionServer
+from mavsitl.services.parameter import ParameterServer
+from mavsitl.services.timesync import PingServer, TimesyncServer
+from mavsitl.signing import Signing
+from mavsitl_vehicle.autopilot import commands, metadata, telemetry
+from mavsitl_vehicle.autopilot.parameters import Parameters
+from mavsitl_vehicle.autopilot.plan import VehiclePlan
+
+if TYPE_CHECKING:
+    from mavsitl_vehicle.autopilot.autopilot import Autopilot
+
+COMPONENT_ID = mavlink.MAV_COMP_ID_AUTOPILOT1
+
+FORWARDED_HZ, FORWARDED_BURST = 2000.0, 200.0
+"""Frames of others passed on to a link, at most."""
+
+SANDBOX, LOGS = "/fs/microsd", "/fs/microsd/log"
+"""PX4's places of the memory card and of the logs on it."""
+
+
+class Shared:
+    """What the links of one vehicle share: parameters, plans, files, key."""
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        plan: VehiclePlan,
+        *,
+        card: Path | None = None,
+        logs: Path | None = None,
+        signing: Signing | None = None,
+    ) -> None:
+        """`card`: a folder that MAVLink FTP may write to; `logs`: where the logs are; None: there is none."""
+        self.parameters = parameters
+        self.plan = plan
+        self.signing = signing
+        names = (uri.rsplit("/", 1)[-1] for uri in (metadata.GENERAL_URI, metadata.PLAIN_URI, metadata.PACKED_URI))
+        extras = {name: _extra(f"{metadata.FOLDER}/{name}") for name in names}
+        mounts: dict[str, FileTree] = {metadata.FOLDER: MemoryFiles(extras)}
+        if card is not None:
+            mounts[SANDBOX] = Folder(card, Quota())
+        log_tree: FileTree = MemoryFiles({})
+        if logs is not None:
+            log_tree = mounts[LOGS] = Folder(logs)
+        self.files = Mounts(mounts)
+        self.logs = TreeLogs(log_tree)
+
+
+@cache
+def _extras() -> dict[str, bytes]:
+    return metadata.files()
+
+
+def _extra(name: str) -> Any:
+    """Made when it is first asked for: packing it takes longer than the rest of the start."""
+    return lambda: _extras()[name]
+
+
+class Port:
+    """One link of the autopilot."""
+
+    def __init__(self, name: str, index: int, autopilot: Autopilot, shared: Shared, *, lockstep: bool) -> None:
+        """`name`: "offboard" or "gcs", which decides on the streams that are sent unasked."""
+        self.name = name
+        signing = None if shared.signing is None else shared.signing.link(index)
+        self.node = Node(autopilot.system_id, COMPONENT_ID, signing)
+        profile: telemetry.Profile = "gcs" if name == "gcs" else "offboard"
+        self.schedule = telemetry.Schedule("lockstep" if lockstep else profile)
+        self._autopilot = autopilot
+        self._commands = CommandServer(self._execute)
+        self._forwarded = TokenBucket(FORWARDED_HZ, FORWARDED_BURST)
+        parameters = ParameterServer(shared.parameters, autopilot.warn_parameter)
+        missions = MissionServer(shared.plan.stores, current_interval_us=None if lockstep else 1_000_000)
+        self._files = FtpServer(shared.files)
+        self._logs = LogServer(shared.logs)
+        self._stepped: tuple[Service, ...] = (parameters, missions, self._files, self._logs)
+        self._services: dict[int, Service] = {
+            mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: parameters,
+            mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ: parameters,
+            mavlink.MAVLINK_MSG_ID_PARAM_SET: parameters,
+            mavlink.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL: self._files,
+            mavlink.MAVLINK_MSG_ID_LOG_REQUEST_LIST: self._logs,
+            mavlink.MAVLINK_MSG_ID_LOG_REQUEST_DATA: self._logs,
+            mavlink.MAVLINK_MSG_ID_LOG_REQUEST_END: self._logs,
+            mavlink.MAVLINK_MSG_ID_LOG_ERASE: self._logs,
+            mavlink.MAVLINK_MSG_ID_TIMESYNC: TimesyncServer(),
+            mavlink.MAVLINK_MSG_ID_PING: PingServer(),
+            **dict.fromkeys(missions.message_ids, missions),
+        }
+
+    @property
+    def message_ids(self) -> frozenset[int]:
+        """What `receive` takes."""
+        commands_in = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
+        return frozenset((*self._services, *commands_in))
+
+    def receive(self, message: Message, sender: Peer, now_us: int) -> bool:
+        """A message that is meant for this vehicle and no setpoint: False where nobody here takes it."""
+        kind = type(message).id
+        if kind in (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT):
+            command, result = self._commands.receive(message, *sender, now_us)
+            self.node.send(telemetry.COMMAND_ACK, command, result, 0, 0, *sender)
+            return True
+        service = self._services.get(kind)
+        if service is None:
+            return False
+        for answer in service.receive(message, sender, now_us):
+            self.node.send_message(answer)
+        return True
+
+    def forward(self, frame: bytes, now_us: int) -> None:
+        """Another component's frame, meant for somebody on this link."""
+        if self._forwarded.take(now_us):
+            self.node.forward(bytes(frame))
+
+    def step(self, now_us: int) -> None:
+        """What the services have to send by themselves."""
+        for service in self._stepped:
+            for message in service.step(now_us):
+                self.node.send_message(message)
+
+    def close(self) -> None:
+        """Close the files that clients had open."""
+        self._files.close()
+        self._logs.close()
+
+    def _execute(self, command: Command, now_us: int) -> int:
+        return commands.execute(self._autopilot, command, now_us, self)
