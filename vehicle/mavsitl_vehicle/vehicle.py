@@ -15,6 +15,7 @@ from mavsitl.log import topics
 from mavsitl.log.block import Array, Block, ned
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
+from mavsitl.signing import EPOCH_UNIX_US, Signing, SigningMode, SigningState
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot import modes
 from mavsitl_vehicle.autopilot.autopilot import Autopilot
@@ -29,6 +30,9 @@ from mavsitl_vehicle.autopilot.storage import Store, keep_parameters
 from mavsitl_vehicle.simulation import Simulation
 
 PLAN_SCHEMA = 1
+SIGNING_SCHEMA = 1
+SIGNING_STORE_US = 1_000_000
+"""So often the signing state is looked at; it is written when the time stamps near what was stored."""
 
 
 class Vehicle:
@@ -46,12 +50,14 @@ class Vehicle:
         state: Path | None = None,
         logs: Path | None = None,
         unix_us: Callable[[], int] | None = None,
+        trusted: bool = True,
     ) -> None:
         """`ports` name the links in order: "offboard", "gcs".
 
         In `lockstep` the state is streamed every tick from the first. `state` is a folder for what outlives the process
         (parameters, plans, the memory card), `logs` where its logs are; None: nothing is kept, or shown. `unix_us` is
-        the wall clock, for SYSTEM_TIME; None: not known.
+        a clock that does not jump, for SYSTEM_TIME and signatures; None: not known, and then there is no signing. A
+        first signing key is taken only where the links are `trusted`: on loopback.
         """
         self.period_us = flight.scenario.rates.control_period_us
         self._flight = flight
@@ -76,8 +82,11 @@ class Vehicle:
             changed=lambda mission_type: plan_store.put(json.loads(self.plan.to_json())),
         )
         self._load_plan(plan_store)
+        self._signing_store = Store(state, "signing", SIGNING_SCHEMA, self._notes.append, private=True)
+        self._signing = self._load_signing()
+        self._signing_us = 0
         card = None if state is None else state / "card"
-        self._shared = Shared(self.parameters, self.plan, card=card, logs=logs)
+        self._shared = Shared(self.parameters, self.plan, card=card, logs=logs, signing=self._signing, trusted=trusted)
         self.simulation = Simulation(flight, self.parameters, seed)
         self.autopilot = self._boot(0)
         self.parameters.subscribe(self._on_parameter)
@@ -95,6 +104,26 @@ class Vehicle:
                 self.plan.load_json(json.dumps(content))
             except PlanError as error:
                 self._notes.append(f"{store.path}: left out: {error}")
+
+    def _load_signing(self) -> Signing | None:
+        if self._unix_us is None:
+            return None
+        unix_us, state = self._unix_us, SigningState()
+        content = self._signing_store.load()
+        if content:
+            try:
+                state = SigningState.from_bytes(bytes.fromhex(content["state"]))
+            except (KeyError, TypeError, ValueError):
+                self._notes.append(f"{self._signing_store.path}: damaged, signing begins without a key")
+        signing = Signing(lambda: unix_us() - EPOCH_UNIX_US, state=state)
+        signing.policy.mode = SigningMode(int(self.parameters["MAV_SIGN_CFG"]))
+        return signing
+
+    def _keep_signing(self, state: SigningState | None) -> None:
+        if self._signing is not None and state is not None:
+            self._signing_store.put({"state": state.to_bytes().hex()})
+            if self._signing_store.flush():
+                self._signing.saved(state)
 
     def _boot(self, now_us: int) -> Autopilot:
         """An autopilot whose clock begins at `now_us` of the driver's."""
@@ -169,6 +198,11 @@ class Vehicle:
         self._record.write(self._now_us, self)
         for store in self._stores:
             store.step(self._now_us)
+        if self._signing is not None:
+            self._signing.policy.locked = autopilot.commander.armed
+            if self._now_us - self._signing_us >= SIGNING_STORE_US:
+                self._signing_us = self._now_us
+                self._keep_signing(self._signing.unsaved())
         if autopilot.released_us is not None and not autopilot.commander.armed:
             self._done = True
             self._after_flight()
@@ -177,6 +211,8 @@ class Vehicle:
         """Write what is not written yet and close the files that clients had open."""
         for store in self._stores:
             store.close()
+        if self._signing is not None and self._signing.has_key:
+            self._keep_signing(self._signing.closing_state())
         for port in self.autopilot.ports:
             port.close()
 
@@ -199,6 +235,8 @@ class Vehicle:
 
     def _on_parameter(self, name: str, value: float) -> None:
         self.simulation.set_parameter(name)
+        if name == "MAV_SIGN_CFG" and self._signing is not None:
+            self._signing.policy.mode = SigningMode(int(value))
         if name.startswith(("BAT", "SIM_BAT")):
             self.autopilot.battery.settings = battery_settings(self.parameters)
 

@@ -46,11 +46,13 @@ class Shared:
         card: Path | None = None,
         logs: Path | None = None,
         signing: Signing | None = None,
+        trusted: bool = True,
     ) -> None:
         """`card`: a folder that MAVLink FTP may write to; `logs`: where the logs are; None: there is none."""
         self.parameters = parameters
         self.plan = plan
         self.signing = signing
+        self.trusted = trusted
         names = (uri.rsplit("/", 1)[-1] for uri in (metadata.GENERAL_URI, metadata.PLAIN_URI, metadata.PACKED_URI))
         extras = {name: _extra(f"{metadata.FOLDER}/{name}") for name in names}
         mounts: dict[str, FileTree] = {metadata.FOLDER: MemoryFiles(extras)}
@@ -79,7 +81,7 @@ class Port:
     def __init__(self, name: str, index: int, autopilot: Autopilot, shared: Shared, *, lockstep: bool) -> None:
         """`name`: "offboard" or "gcs", which decides on the streams that are sent unasked."""
         self.name = name
-        signing = None if shared.signing is None else shared.signing.link(index)
+        signing = None if shared.signing is None else shared.signing.link(index, shared.trusted)
         self.node = Node(autopilot.system_id, COMPONENT_ID, signing)
         profile: telemetry.Profile = "gcs" if name == "gcs" else "offboard"
         self.schedule = telemetry.Schedule("lockstep" if lockstep else profile)
