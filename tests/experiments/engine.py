@@ -119,11 +119,12 @@ class Watched:
         return self._core.datagrams(port, combine=combine)
 
 
-def job(name: str, overrides: Overrides, seed: int) -> Job:
-    """Raises `ScenarioError`."""
+def job(name: str, overrides: Overrides, seed: int, airframe: Overrides | None = None) -> Job:
+    """`airframe`: fields of the airframe that differ from the named one's. Raises `ScenarioError`."""
     flight = load(name, overrides)
     scenario = msgspec.structs.replace(flight.scenario, seed=seed)
-    flight = msgspec.structs.replace(flight, scenario=scenario)
+    changed = msgspec.structs.replace(flight.airframe, **(airframe or {}))
+    flight = msgspec.structs.replace(flight, scenario=scenario, airframe=changed)
     digest = hashlib.blake2b(digest_size=16)
     digest.update(source_digest().encode())
     digest.update(msgspec.json.encode((scenario, flight.airframe, seed)))

@@ -15,7 +15,7 @@ from mavsitl.log.flight import FlightData
 from mavsitl.log.ulog import MemoryRecorder
 from mavsitl.report.metrics import PAPER_TABLES, maximum_error, rmse
 from tests.bench import bench_lockstep
-from tests.experiments import engine, learning, results, stability
+from tests.experiments import engine, learning, limits, results, stability
 from tests.experiments.engine import Job, Outcome
 from tests.experiments.sums import first_weights
 
@@ -191,5 +191,15 @@ def test_stability_shows_when_a_law_diverged() -> None:
 
 
 @pytest.mark.sockets
+def test_limits_changes_one_thing_at_a_time(capsys: pytest.CaptureFixture[str]) -> None:
+    lags = [case for case in limits.cases() if case.group == "lag"]
+    flights = [engine.job("hover-wind", case.overrides, 1, case.airframe).flight for case in lags]
+    assert [flight.airframe.rotor_time_constant_s for flight in flights] == [0.0, 0.005, 0.01, 0.02, 0.03]
+    assert len({msgspec.json.encode(flight.scenario) for flight in flights}) == 1
+    assert limits.main(["--quick", "--jobs", "1"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert len(rows) == len(limits.cases()) + 3
+
+
 def test_the_rival_of_the_benchmark_hovers() -> None:
     assert isfinite(bench_lockstep.fly_rival(0.5))
