@@ -97,7 +97,7 @@ def test_shipped_airframe_is_the_papers_vehicle(name: str) -> None:
 
 
 def test_full_coupling_is_eq_4_as_printed() -> None:
-    assert scenario.load("hover-full-coupling").airframe.wind_coupling == 1.0
+    assert scenario.load("hover-wind", {"airframe": "full-coupling"}).airframe.wind_coupling == 1.0
 
 
 def test_a_scenario_file_is_found_by_path_and_its_airframe_and_waypoints_beside_it(tmp_path: Path) -> None:
