@@ -76,7 +76,7 @@ class Vehicle:
         parameter_store = keep_parameters(self.parameters, state, self._notes.append)
         self.parameters.put("MAV_SYS_ID", system_id)  # what was kept does not outweigh what was asked for
         plan_store = Store(state, "plan", PLAN_SCHEMA, self._notes.append)
-        self._stores = (parameter_store, plan_store)
+        self._stores = () if state is None else (parameter_store, plan_store)
         self.plan = VehiclePlan(
             report=lambda severity, text: self.autopilot.queue_text(severity, text),
             changed=lambda mission_type: plan_store.put(json.loads(self.plan.to_json())),
@@ -173,9 +173,14 @@ class Vehicle:
         """Frames received and refused, by reason, of the first port."""
         return self.autopilot.ports[0].node.counters
 
-    def receive(self, port: int, datagram: bytes) -> int:
-        """One datagram from a link; the number of valid frames in it."""
-        return self.autopilot.receive(port, datagram, max(self._now_us - self._boot_us, 0))
+    def receive(self, port: int, datagram: bytes, at_us: int | None = None) -> int:
+        """One datagram from a link; the number of valid frames in it.
+
+        What it decides counts from the last tick. `at_us`, between that and the next, is what the services' clock
+        shows, TIMESYNC's above all; None: the tick.
+        """
+        now_us = max(self._now_us - self._boot_us, 0)
+        return self.autopilot.receive(port, datagram, now_us, None if at_us is None else at_us - self._boot_us)
 
     def step(self, now_us: int) -> None:
         """Fly from the last step to `now_us`, one control period later, and say what is to be said there."""
@@ -230,8 +235,9 @@ class Vehicle:
         self._boot_us = now_us
         self.autopilot = self._boot(now_us)
         self.autopilot.held = old.held
-        for port in old.ports:
-            port.close()
+        for port, before in zip(self.autopilot.ports, old.ports, strict=True):
+            port.node = before.node  # the answer to the command is still in it, and clients count on with its numbers
+            before.close()
 
     def _on_parameter(self, name: str, value: float) -> None:
         self.simulation.set_parameter(name)

@@ -50,6 +50,8 @@ LANDING_TIME_US = 300_000
 LANDING_FILTER_S = 0.3
 LIFT_MARGIN_M = 0.1
 """An off-board position so far above the vehicle asks to leave the ground."""
+LOOK_US = 12_000
+"""So often the commander decides (PX4's: every 10 ms). A command, or a stream that returns, makes it look at once."""
 HOUSEKEEPING_US = 100_000
 """Battery, fence, health: what needs no control period."""
 
@@ -135,6 +137,8 @@ class Autopilot:
         self._landed_state = ON_GROUND
         self._flown: Mode | None = None
         """The mode flown in the last period; None: disarmed."""
+        self._control = Control.NOBODY
+        """Who makes the setpoints of that mode."""
         self._cascade = False
         """The position cascade flew in the last period."""
         self._lift_us: int | None = None
@@ -148,6 +152,7 @@ class Autopilot:
         """Height and velocity for the landing detector, with the sensors' noise filtered out."""
         self._smoothing = min(period_s / LANDING_FILTER_S, 1.0)
         self._gcs_us: int | None = None
+        self._look_us = 0
         self._housekept_us = -HOUSEKEEPING_US
         self.mission_refusal: str | None = "no mission"
         self._fence_breach: str | None = None
@@ -170,22 +175,27 @@ class Autopilot:
 
     # --- messages in -------------------------------------------------------------------------------------------------
 
-    def receive(self, port_index: int, datagram: bytes, now_us: int) -> int:
-        """Take one datagram from a link; the number of valid MAVLink frames in it. Never raises on what is in it."""
+    def receive(self, port_index: int, datagram: bytes, now_us: int, at_us: int | None = None) -> int:
+        """Take one datagram from a link; the number of valid MAVLink frames in it. Never raises on what is in it.
+
+        `now_us` is the last tick's time, `at_us` when the datagram came; None: then.
+        """
         port = self.ports[port_index]
         node = port.node
         frames = node.receive(datagram)
         self._now_us = now_us
+        several = len(self.ports) > 1
         for frame in frames:
             message = frame.message
-            self._router.note(port_index, (frame.system_id, frame.component_id), now_us)
+            if several:
+                self._router.note(port_index, (frame.system_id, frame.component_id), now_us)
             if node.addressed_to(frame):
                 handler = self._handlers.get(type(message).id)
                 if handler is not None:
                     handler(message, frame, now_us)
-                elif not port.receive(message, (frame.system_id, frame.component_id), now_us):
+                elif not port.receive(message, (frame.system_id, frame.component_id), now_us, at_us):
                     node.counters.unsupported += 1
-            if len(self.ports) > 1:
+            if several:
                 for other in self._router.destinations(port_index, frame, now_us):
                     self.ports[other].forward(message.get_msgbuf(), now_us)
         return len(frames)
@@ -213,6 +223,8 @@ class Autopilot:
             self.warn("setpoint", setpoint.text)
         else:
             self.setpoint, self.setpoint_us = setpoint, now_us
+            if self.commander.failsafe:
+                self._look_us = now_us
 
     def _on_manual_control(self, message: Message, frame: Frame, now_us: int) -> None:
         if message.target in (0, self.system_id):
@@ -375,6 +387,7 @@ class Autopilot:
     def look(self, now_us: int) -> None:
         """Step the commander with what is known now."""
         self._now_us = now_us
+        self._look_us = now_us + LOOK_US
         setpoint_us, sticks_us, gcs_us = self.setpoint_us, self.pilot.received_us, self._gcs_us
         was_armed = self.commander.armed
         self.commander.step(
@@ -395,7 +408,8 @@ class Autopilot:
         """Before the physics: step the commander, and the setpoint for the inner loops; None stops the rotors."""
         if now_us - self._housekept_us >= HOUSEKEEPING_US or now_us < self._housekept_us:
             self._keep_house(now_us)
-        self.look(now_us)
+        if now_us >= self._look_us:
+            self.look(now_us)
         commander = self.commander
         if not commander.armed:
             if self._flown is not None:
@@ -404,7 +418,7 @@ class Autopilot:
         mode = commander.mode
         if mode is not self._flown:
             self._switch(mode, now_us)
-        control = modes.TABLE[mode].control
+        control = self._control
         if control is Control.STREAM:
             setpoint = self._follow_stream(now_us)
         elif control is Control.NAVIGATOR:
@@ -434,9 +448,13 @@ class Autopilot:
     def _navigate(self, now_us: int) -> Setpoint | None:
         state = State.of(self.estimate)
         on_ground = self._landed_state == ON_GROUND
-        if on_ground and not (self.commander.spooled_up(now_us) and self.navigator.wants_lift()):
-            self._rest()
-            return None
+        if on_ground:
+            ready = self.commander.spooled_up(now_us)
+            if ready:
+                self.navigator.stand(state, now_us)
+            if not (ready and self.navigator.wants_lift()):
+                self._rest()
+                return None
         target, climb_limit = self.navigator.update(state, now_us)
         finished = self.navigator.finished
         if finished is Mode.TAKEOFF:
@@ -479,6 +497,7 @@ class Autopilot:
         if self._flown is None:
             self._arm(now_us)
         self._flown = mode
+        self._control = control
         if control is Control.NAVIGATOR:
             acceleration = self._position_control.acceleration_setpoint_nwu_m_s2 if self._cascade else (0.0, 0.0, 0.0)
             self.navigator.enter(mode, state, acceleration, self.on_ground, now_us)

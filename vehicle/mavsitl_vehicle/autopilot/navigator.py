@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum, auto
-from math import atan2, cos, hypot, inf, isfinite, nan, pi, radians, sin
+from math import atan2, cos, hypot, inf, isfinite, nan, pi, radians, sin, tan
 from typing import Protocol
 
 from mavsitl.frames import Vector
 from mavsitl_vehicle.autopilot.modes import Mode
 from mavsitl_vehicle.autopilot.position import Values
 from mavsitl_vehicle.autopilot.setpoints import FREE, PositionSetpoint, State
-from mavsitl_vehicle.autopilot.trajectory import Trajectory, landing_speed, takeoff_climb_limit
+from mavsitl_vehicle.autopilot.trajectory import SERVO_PER_S, Trajectory, landing_speed, takeoff_climb_limit
 
 REACHED_SHARE = 0.95
 """Of a take-off's height: then it is done, as clients see it by relative_alt."""
@@ -38,6 +38,7 @@ class Task(Enum):
     GO = auto()
     DESCEND = auto()
     ORBIT = auto()
+    RETURN = auto()
 
 
 class Home(Protocol):
@@ -90,9 +91,13 @@ class Navigator:
         self._takeoff_height: float | None = None
         self._takeoff_position: tuple[float, float] | None = None
         self._takeoff_yaw_rad: float | None = None
+        self._takeoff_asked = False
+        """By parameters of its own, which no take-off has followed yet."""
         self._target_height = 0.0
         self._ground_height = 0.0
         self._lift_us: int | None = None
+        self._ramping = False
+        """The mode began on the ground: its first climb is a take-off's."""
         self._speed = nan
         self._climb = nan
         self._sink = nan
@@ -111,6 +116,7 @@ class Navigator:
     ) -> None:
         """NAV_TAKEOFF's parameters; None: MIS_TAKEOFF_ALT over the ground, straight up, the heading it has."""
         self._takeoff_height, self._takeoff_position, self._takeoff_yaw_rad = height_m, position_xy_m, yaw_rad
+        self._takeoff_asked = True
 
     def go_to(self, position_nwu_m: Vector, yaw_rad: float = nan, speed_m_s: float = nan) -> None:
         """DO_REPOSITION in AUTO.LOITER: fly there and hold. NaN: here, this height, the heading as it is."""
@@ -133,7 +139,7 @@ class Navigator:
             self._sink = speed_m_s
         else:
             self._speed = speed_m_s
-        if self._task is Task.GO:
+        if self._task in (Task.GO, Task.RETURN):
             self._aim_again()
 
     # --- a period ----------------------------------------------------------------------------------------------------
@@ -142,10 +148,20 @@ class Navigator:
         """`mode` flies from now on, from the vehicle's own motion: no jump."""
         if self._mode is Mode.MISSION and mode is not Mode.MISSION:
             self._course.pause()
+        arrived = self.finished is Mode.TAKEOFF and mode is Mode.LOITER and self._pending_go is None
         self._mode = mode
         self.finished = None
+        if mode is not Mode.TAKEOFF:
+            self._takeoff_height = self._takeoff_yaw_rad = None
+            self._takeoff_asked = False
+        if mode in (Mode.TAKEOFF, Mode.RTL, Mode.LAND):
+            self._forget_speeds()
+        if arrived:
+            self._stay_up()
+            return
         self._motion.engage(state, acceleration_nwu_m_s2)
         self._hold()
+        self._ramping = on_ground
         if on_ground:
             self._ground_height = state.position_nwu_m[2]
             self._lift_us = None
@@ -170,10 +186,22 @@ class Navigator:
             self._course.pause()
         self._mode = None
         self.landing = False
+        self.finished = None
+        self._pending_go = self._pending_orbit = None
+        self._forget_speeds()
+
+    def stand(self, state: State, now_us: int) -> None:
+        """A period on the ground, in which a mission's first item is taken up, and a landing is seen to be done."""
+        if not self.wants_lift():
+            self._motion.engage(state)
+            self._ramping = True
+            self._lift_us = None
+        if self._mode is Mode.MISSION:
+            self._course.step(self, state, now_us)
 
     def wants_lift(self) -> bool:
         """On the ground: should the rotors lift?"""
-        return self._task in (Task.TAKEOFF, Task.GO) or self._task is Task.ORBIT
+        return self._task in (Task.TAKEOFF, Task.GO)
 
     def update(self, state: State, now_us: int) -> tuple[PositionSetpoint, float]:
         """The setpoint and the largest climb, m/s: while it lifts off, the ramp's."""
@@ -181,14 +209,20 @@ class Navigator:
             self._course.step(self, state, now_us)
         elif self._mode is Mode.RTL:
             self.step_return(state, now_us)
-        elif self._mode is Mode.TAKEOFF and self.takeoff_done(state):
-            self.finished = Mode.TAKEOFF
+        elif self._mode is Mode.TAKEOFF:
+            if self._takeoff_asked:  # NAV_TAKEOFF once more
+                self._begin_takeoff(state)
+            if self.takeoff_done(state):
+                self.finished = Mode.TAKEOFF
+        elif self._mode is Mode.ORBIT and self._pending_orbit is not None:
+            self._begin_orbit(state)
+            self._pending_orbit = None
         if self._task is Task.ORBIT:
             self._circle(state)
         elif self._task is Task.DESCEND:
             self._motion.climb(-landing_speed(state.position_nwu_m[2] - self._ground_under(), self._parameters))
         limit = inf
-        if self.wants_lift():
+        if self._ramping and self.wants_lift():
             if self._lift_us is None:
                 self._lift_us = now_us
             limit = takeoff_climb_limit((now_us - self._lift_us) / 1e6, self._gravity, self._parameters)
@@ -272,7 +306,7 @@ class Navigator:
         self._motion.go_to(self._motion.aim_nwu_m, speed_m_s=speed, climb_m_s=self._climb, sink_m_s=self._sink)
 
     def _begin_takeoff(self, state: State) -> None:
-        base = max(self._ground_under(), -inf)
+        base = self._ground_under()
         height = self._takeoff_height
         if height is None:
             height = base + self._parameters["MIS_TAKEOFF_ALT"]
@@ -283,11 +317,18 @@ class Navigator:
         yaw = self._takeoff_yaw_rad
         self.take_off(height, self._takeoff_position, nan if yaw is None else yaw)
         self._takeoff_height = self._takeoff_yaw_rad = None
+        self._takeoff_asked = False
 
-    def after_takeoff(self) -> tuple[float, float] | None:
-        """Where NAV_TAKEOFF wanted to go once up."""
+    def _stay_up(self) -> None:
+        """A take-off has arrived, all but its last share: on to its very height, or to the place that it named."""
         position, self._takeoff_position = self._takeoff_position, None
-        return position
+        self._hold()
+        if position is not None:
+            self._fly_to((*position, self._target_height), nan, nan)
+
+    def _forget_speeds(self) -> None:
+        """DO_CHANGE_SPEED holds for what is flown until somebody else flies, or another flight, a return begins."""
+        self._speed = self._climb = self._sink = nan
 
     def begin_return(self, state: State) -> None:
         """Climb to RTL_RETURN_ALT, go home, sink to RTL_DESCEND_ALT, wait RTL_LAND_DELAY, land."""
@@ -297,12 +338,23 @@ class Navigator:
             return
         x, y, z = state.position_nwu_m
         away = hypot(x - home.position_nwu_m[0], y - home.position_nwu_m[1])
-        height = max(home.position_nwu_m[2] + self._parameters["RTL_RETURN_ALT"], z)
-        if away < self._parameters["NAV_ACC_RAD"]:  # PX4: close to home it does not climb first
-            height = max(z, home.position_nwu_m[2] + min(self._parameters["RTL_DESCEND_ALT"], height))
+        height = max(home.position_nwu_m[2] + self._return_height(away), z)
         self._return = ReturnPhase.CLIMB
-        self._fly_to((nan, nan, height), nan, nan)
-        self._task = Task.GO
+        self._return_by((nan, nan, height))
+
+    def _return_height(self, away_m: float) -> float:
+        """Above home: RTL_RETURN_ALT; nearer than RTL_MIN_DIST no more than the cone of RTL_CONE_ANG asks for."""
+        p = self._parameters
+        height, angle = p["RTL_RETURN_ALT"], p["RTL_CONE_ANG"]
+        if away_m > p["RTL_MIN_DIST"] or angle <= 0.0:
+            return height
+        cone = away_m / tan(radians(angle)) if angle < 90.0 else 0.0
+        return min(height, max(cone, p["RTL_DESCEND_ALT"] if angle >= 90.0 else 2.0 * p["NAV_ACC_RAD"]))
+
+    def _return_by(self, position_nwu_m: Vector, yaw_rad: float = nan) -> None:
+        """A leg of the return. As on PX4 a return never lifts a vehicle that stands on the ground."""
+        self._fly_to(position_nwu_m, yaw_rad, nan)
+        self._task = Task.RETURN
 
     def step_return(self, state: State, now_us: int) -> None:
         """On to the next phase of a return, where this one is done."""
@@ -315,11 +367,11 @@ class Navigator:
         phase = self._return
         if phase is ReturnPhase.CLIMB and abs(z - self.aim_nwu_m[2]) < REACHED_M:
             bearing = atan2(hy - y, hx - x) if hypot(hx - x, hy - y) > acceptance else nan
-            self._fly_to((hx, hy, self.aim_nwu_m[2]), bearing, nan)
+            self._return_by((hx, hy, self.aim_nwu_m[2]), bearing)
             self._return = ReturnPhase.CRUISE
         elif phase is ReturnPhase.CRUISE and self.reached(state, min(acceptance, 1.0)):
             lower = min(z, hz + self._parameters["RTL_DESCEND_ALT"])
-            self._fly_to((hx, hy, lower), home.yaw_rad, nan)
+            self._return_by((hx, hy, lower), home.yaw_rad)
             self._return = ReturnPhase.LOWER
         elif phase is ReturnPhase.LOWER and self.reached(state, acceptance):
             self._wait_us = now_us
@@ -350,8 +402,10 @@ class Navigator:
         turn = -1.0 if radius > 0.0 else 1.0  # clockwise seen from above is negative about the z axis
         back = min(max(ORBIT_GAIN_PER_S * (abs(radius) - away), -speed), speed)
         along = (max(speed * speed - back * back, 0.0)) ** 0.5
+        back -= along * along / (abs(radius) * SERVO_PER_S)  # the motion follows its velocity by that lag
         self._motion.steer((back * ux - turn * along * uy, back * uy + turn * along * ux))
-        self._motion.go_to((nan, nan, height), atan2(-uy, -ux), climb_m_s=self._climb, sink_m_s=self._sink)
+        self._motion.go_to((nan, nan, height), climb_m_s=self._climb, sink_m_s=self._sink)
+        self._motion.turn_to(atan2(-uy, -ux), turn * along / abs(radius))
 
     def _ground_under(self) -> float:
         """Flat ground: where it last stood, or home's height."""

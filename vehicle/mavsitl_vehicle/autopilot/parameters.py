@@ -184,7 +184,7 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
     ),
     _group(
         "MAVLink",
-        _int("MAV_SYS_ID", 1, 1, 250, "", "MAVLink system id", live="boot"),
+        _int("MAV_SYS_ID", 1, 1, 255, "", "MAVLink system id", live="boot", note="PX4: 1 to 250"),
         _int("MAV_COMP_ID", 1, 1, 1, "", "MAVLink component id", live="boot", used_by="client", note="PX4: 1 to 250"),
         _choice("MAV_TYPE", 2, {2: "Quadrotor"}, "Vehicle type in HEARTBEAT", live="boot", used_by="client",
                 note="PX4: 0, set by its start-up script"),
@@ -193,8 +193,8 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
                 used_by="client", note="always on here"),
         _choice("MAV_SIGN_CFG", 0, {0: "Off", 1: "All links but USB", 2: "All links"},
                 "On which links unsigned messages are refused",
-                "Only where a key was set by SETUP_SIGNING. There is no USB link here: 1 and 2 are the same.",
-              used_by="client", note="not in PX4 1.17"),
+                "Only where a key was set by SETUP_SIGNING. 1 leaves out links on loopback, which are trusted as USB is.",
+                note="not in PX4 1.17"),
         _int("MAV_RADIO_TOUT", 5, 1, 250, "s", "Silence after which a reported radio counts as gone", used_by="client"),
     ),
     _group(
@@ -279,9 +279,9 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
               decimals=1, note="PX4: 30; its multicopters have 10"),
         _real("RTL_LAND_DELAY", 0, -1, 3600, "s", "Wait at RTL_DESCEND_ALT; negative: for ever", decimals=1),
         _real("RTL_MIN_DIST", 10, 0.5, 10_000, "m", "Nearer than this, it returns at the height of RTL_CONE_ANG",
-              decimals=1, used_by="client"),
+              decimals=1),
         _int("RTL_CONE_ANG", 45, 0, 90, "deg", "Half angle of the cone that limits the climb before the return",
-             "0: always climb to RTL_RETURN_ALT; 90: to RTL_DESCEND_ALT only.", used_by="client"),
+             "0: always climb to RTL_RETURN_ALT; 90: to RTL_DESCEND_ALT only."),
     ),
     _group(
         "Mission",

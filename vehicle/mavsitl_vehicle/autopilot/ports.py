@@ -31,6 +31,10 @@ COMPONENT_ID = mavlink.MAV_COMP_ID_AUTOPILOT1
 FORWARDED_HZ, FORWARDED_BURST = 2000.0, 200.0
 """Frames of others passed on to a link, at most."""
 
+BUSY_US = 10_000_000
+"""After a client's last word the services are stepped in every period for so long, and then every `IDLE_STEP_US`."""
+IDLE_STEP_US = 100_000
+
 SANDBOX, LOGS = "/fs/microsd", "/fs/microsd/log"
 """PX4's places of the memory card and of the logs on it."""
 
@@ -87,6 +91,8 @@ class Port:
         self.schedule = telemetry.Schedule("lockstep" if lockstep else profile)
         self._autopilot = autopilot
         self._commands = CommandServer(self._execute)
+        self._busy_until_us = 0
+        self._step_us = 0
         self._forwarded = TokenBucket(FORWARDED_HZ, FORWARDED_BURST)
         parameters = ParameterServer(shared.parameters, autopilot.warn_parameter)
         missions = MissionServer(shared.plan.stores, current_interval_us=None if lockstep else 1_000_000)
@@ -113,8 +119,11 @@ class Port:
         commands_in = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
         return frozenset((*self._services, *commands_in))
 
-    def receive(self, message: Message, sender: Peer, now_us: int) -> bool:
-        """A message that is meant for this vehicle and no setpoint: False where nobody here takes it."""
+    def receive(self, message: Message, sender: Peer, now_us: int, at_us: int | None = None) -> bool:
+        """A message that is meant for this vehicle and no setpoint: False where nobody here takes it.
+
+        Commands act at the tick `now_us`, the other services at `at_us`, which is not before it; None: the same.
+        """
         kind = type(message).id
         if kind in (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT):
             command, result = self._commands.receive(message, *sender, now_us)
@@ -123,7 +132,9 @@ class Port:
         service = self._services.get(kind)
         if service is None:
             return False
-        for answer in service.receive(message, sender, now_us):
+        self._busy_until_us = now_us + BUSY_US
+        self._step_us = now_us
+        for answer in service.receive(message, sender, now_us if at_us is None else at_us):
             self.node.send_message(answer)
         return True
 
@@ -134,6 +145,10 @@ class Port:
 
     def step(self, now_us: int) -> None:
         """What the services have to send by themselves."""
+        if now_us < self._step_us:
+            return
+        if now_us >= self._busy_until_us:
+            self._step_us = now_us + IDLE_STEP_US
         for service in self._stepped:
             for message in service.step(now_us):
                 self.node.send_message(message)

@@ -1011,8 +1011,8 @@ def request(subject: Subject, node: Node, message_id: int, index: int, now_us: i
 Profile: TypeAlias = Literal["gcs", "offboard", "lockstep"]
 
 _LOCKSTEP_HZ = {
-    "HEARTBEAT": 1, "SYS_STATUS": 5, "EXTENDED_SYS_STATE": 5, "ATTITUDE": 50, "ATTITUDE_QUATERNION": 50,
-    "LOCAL_POSITION_NED": 30, "ODOMETRY": 30,
+    "HEARTBEAT": 1, "SYS_STATUS": 5, "EXTENDED_SYS_STATE": 5, "ATTITUDE": 10, "ATTITUDE_QUATERNION": 10,
+    "LOCAL_POSITION_NED": 10, "ODOMETRY": 30,
 }  # fmt: skip
 """What a lock-step peer flies by: each further message would cost every simulated second."""
 

@@ -55,6 +55,7 @@ class Trajectory:
         self._yaw_rad = 0.0
         self._yaw_rate_rad_s = 0.0
         self._yaw_target_rad = 0.0
+        self._yaw_target_rate_rad_s = 0.0
 
     def engage(self, state: State, acceleration_nwu_m_s2: Vector = (0.0, 0.0, 0.0)) -> None:
         """Begin at the vehicle's own motion and brake. Components that are not known begin at the last motion's."""
@@ -68,7 +69,7 @@ class Trajectory:
         yaw = state.yaw_rad
         if isfinite(yaw):
             self._yaw_rad = yaw
-        self._yaw_rate_rad_s = 0.0
+        self._yaw_rate_rad_s = self._yaw_target_rate_rad_s = 0.0
         self._yaw_target_rad = self._yaw_rad
         self.stop()
 
@@ -111,10 +112,11 @@ class Trajectory:
         """Brake, and hold the point where that ends."""
         self._aims = [_BRAKE, _BRAKE]
 
-    def turn_to(self, yaw_rad: float) -> None:
-        """Turn the shorter way; NaN keeps the yaw aimed at."""
+    def turn_to(self, yaw_rad: float, rate_rad_s: float = 0.0) -> None:
+        """Turn the shorter way, to a yaw that itself turns at `rate_rad_s`; NaN keeps the yaw aimed at."""
         if isfinite(yaw_rad):
             self._yaw_target_rad = yaw_rad
+            self._yaw_target_rate_rad_s = rate_rad_s
 
     @property
     def aim_nwu_m(self) -> Vector:
@@ -234,7 +236,8 @@ class Trajectory:
         acceleration = radians(self._parameters["MPC_YAWRAUTO_ACC"])
         step = acceleration * self._period_s
         # Half the acceleration to brake with leaves the other half to correct: no overshoot on the tick's grid.
-        wanted = copysign(min(largest, sqrt(acceleration * abs(error)), 4.0 * abs(error)), error)
+        wanted = copysign(min(sqrt(acceleration * abs(error)), 4.0 * abs(error)), error)
+        wanted = min(max(wanted + self._yaw_target_rate_rad_s, -largest), largest)
         self._yaw_rate_rad_s += min(max(wanted - self._yaw_rate_rad_s, -step), step)
         self._yaw_rad = remainder(self._yaw_rad + self._yaw_rate_rad_s * self._period_s, 2.0 * pi)
 
