@@ -27,6 +27,7 @@ from mavsitl_vehicle.autopilot.ports import Shared
 from mavsitl_vehicle.autopilot.seated import SeatedLaw
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint
 from mavsitl_vehicle.autopilot.storage import Store, keep_parameters
+from mavsitl_vehicle.autopilot.wind_estimate import WindEstimate
 from mavsitl_vehicle.simulation import Simulation
 
 PLAN_SCHEMA = 1
@@ -91,6 +92,7 @@ class Vehicle:
         self.autopilot = self._boot(0)
         self.parameters.subscribe(self._on_parameter)
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
+        self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
         self._record = _Record(recorder, flight, aboard=self._seated is not None)
         self._now_us = -self.period_us
         self._boot_us = 0
@@ -141,6 +143,11 @@ class Vehicle:
             autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, note)
         self._notes.clear()
         return autopilot
+
+    def continue_from(self, sequence: int) -> None:
+        """The sequence number that comes next on every link: of `boot.heartbeat` some were sent before."""
+        for port in self.autopilot.ports:
+            port.node.continue_from(sequence)
 
     @property
     def token_us(self) -> int:
@@ -198,6 +205,9 @@ class Vehicle:
             flown_s = -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
             simulation.advance(flown_s)
         autopilot.estimate = simulation.estimate[:, 0].tolist()
+        if self._wind is not None:
+            self._wind.update(simulation.estimate, simulation.demand[tick.THRUST, 0], not autopilot.on_ground)
+            autopilot.wind = self._wind.value
         autopilot.observe(now_us)
         autopilot.report(now_us)
         self._record.write(self._now_us, self)

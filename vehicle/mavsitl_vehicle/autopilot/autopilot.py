@@ -121,6 +121,8 @@ class Autopilot:
         self.refused_setpoints = 0
         self.reboot_requested = False
         self.flight_times = FlightTimes()
+        self.wind: telemetry.Wind | None = None
+        """As estimated; None: not known."""
         self.health = Health()
         self.attitude_setpoint: Setpoint | None = None
         """What the inner loops follow."""
@@ -369,11 +371,6 @@ class Autopilot:
         return self.position_setpoint
 
     @property
-    def wind(self) -> None:
-        """Not estimated aboard."""
-        return
-
-    @property
     def sticks(self) -> Axes | None:
         return self.pilot.axes if self.commander.sticks_fresh() else None
 
@@ -385,7 +382,12 @@ class Autopilot:
     # --- a tick ------------------------------------------------------------------------------------------------------
 
     def look(self, now_us: int) -> None:
-        """Step the commander with what is known now."""
+        """Before a request: a plan that was uploaded just now counts."""
+        self._refresh_plan()
+        self._step_commander(now_us)
+
+    def _step_commander(self, now_us: int) -> None:
+        """With what is known now."""
         self._now_us = now_us
         self._look_us = now_us + LOOK_US
         setpoint_us, sticks_us, gcs_us = self.setpoint_us, self.pilot.received_us, self._gcs_us
@@ -409,7 +411,7 @@ class Autopilot:
         if now_us - self._housekept_us >= HOUSEKEEPING_US or now_us < self._housekept_us:
             self._keep_house(now_us)
         if now_us >= self._look_us:
-            self.look(now_us)
+            self._step_commander(now_us)
         commander = self.commander
         if not commander.armed:
             if self._flown is not None:
@@ -544,13 +546,17 @@ class Autopilot:
         if fence_id != self._fence_id:
             self._fence_id = fence_id
             self._fence = self.plan.fence(self.origin)
-        limits = FenceLimits(p["GF_MAX_HOR_DIST"], p["GF_MAX_VER_DIST"]) if p["GF_ACTION"] > 0 else NO_LIMITS
-        seen = (stores.id(MISSION), fence_id, limits, self.home, self.on_ground, p["MIS_TKO_LAND_REQ"])
+        fenced = p["GF_ACTION"] > 0
+        limits = FenceLimits(p["GF_MAX_HOR_DIST"], p["GF_MAX_VER_DIST"]) if fenced else NO_LIMITS
+        seen = (
+            stores.id(MISSION), fence_id, fenced, limits, self.home, self.on_ground,
+            p["MIS_TKO_LAND_REQ"], p["MIS_DIST_1WP"], p["MIS_TAKEOFF_ALT"],
+        )  # fmt: skip
         if seen == self._mission_seen:
             return
         self._mission_seen = seen
         context = FeasibilityContext(
-            self.on_ground, self._global_home(), self.origin, self._fence if p["GF_ACTION"] > 0 else None, limits,
+            self.on_ground, self._global_home(), self.origin, self._fence if fenced else None, limits,
             p["MIS_DIST_1WP"], int(p["MIS_TKO_LAND_REQ"]), p["MIS_TAKEOFF_ALT"],
         )  # fmt: skip
         findings = self.plan.feasibility(context)

@@ -28,6 +28,8 @@ from mavsitl_vehicle.autopilot.position import Values
 from mavsitl_vehicle.autopilot.setpoints import State
 
 NOT_STARTED: int = mavlink.MISSION_STATE_NOT_STARTED
+ACTIVE: int = mavlink.MISSION_STATE_ACTIVE
+COMPLETE: int = mavlink.MISSION_STATE_COMPLETE
 YAW_TIMEOUT_US = 5_000_000
 """A heading that is not reached does not hold the mission up for longer."""
 
@@ -113,7 +115,8 @@ class MissionCourse:
         self._lowering = False
         self._action = turn.fly
         if turn.fly is None:
-            if turn.seq is None:
+            # Complete, or waiting at an item that does not continue: it goes all the way to that item.
+            if self._plan.progress.state not in (ACTIVE, COMPLETE):
                 navigator.hold()
             return
         if self._world.on_ground:

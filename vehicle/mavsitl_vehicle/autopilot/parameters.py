@@ -193,7 +193,7 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
                 used_by="client", note="always on here"),
         _choice("MAV_SIGN_CFG", 0, {0: "Off", 1: "All links but USB", 2: "All links"},
                 "On which links unsigned messages are refused",
-                "Only where a key was set by SETUP_SIGNING. 1 leaves out links on loopback, which are trusted as USB is.",
+                "Only where a key was set by SETUP_SIGNING. 1 leaves out links on loopback, trusted as USB is.",
                 note="not in PX4 1.17"),
         _int("MAV_RADIO_TOUT", 5, 1, 250, "s", "Silence after which a reported radio counts as gone", used_by="client"),
     ),
