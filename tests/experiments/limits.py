@@ -54,13 +54,14 @@ def cases() -> list[Case]:
             "stock", f"MC_*RATE_I {ROLL_RATE_I:g}, yaw {YAW_RATE_I:g}", SEATS["attitude/stock"] | integral, STOCK_SHOWN
         ),
     ]
-    position = load("hover-wind").scenario.controller.position
+    position = msgspec.json.decode(msgspec.json.encode(load("hover-wind").scenario.controller.position))
+    stronger = position | {"k_i_per_s3": STRONGER * position["k_i_per_s3"]}
     blind: Overrides = {"controller.wind_information": "none"}
     none = [
         Case("none", "none, as shipped", blind, NONE_SHOWN),
         Case(
             "none", f"none, position K_I x {STRONGER:g}",
-            blind | {"controller.position.k_i_per_s3": STRONGER * position.k_i_per_s3}, NONE_SHOWN,
+            blind | {"controller.position": stronger}, NONE_SHOWN,
         ),
         Case("none", "observer", {}, NONE_SHOWN),
     ]  # fmt: skip
