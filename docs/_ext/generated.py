@@ -8,6 +8,11 @@
     Each shipped airframe's numbers side by side.
 ``{streams}``
     The vehicle's telemetry: each message with its default rates on both links, PX4's beside, and their sums.
+``{commands}``, ``{mission-commands}``, ``{messages-taken}``
+    What the vehicle does by COMMAND_LONG and COMMAND_INT, what a mission may hold, which other messages it takes.
+``{modes}``, ``{mode-changes}``, ``{failsafes}``
+    The flight modes with PX4's numbers; a drawing of the changes that nobody asked for, found by running the commander;
+    what trips each fail-safe and what it does by the value of its parameter.
 ``{parameter-tables}``
     A section for each group of the vehicle's parameters: name, type, default, allowed values, meaning.
 ``{cli-help} SUBCOMMAND``
@@ -22,19 +27,25 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
 from importlib import import_module, resources
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 from docutils import nodes
-from mavsitl_vehicle.autopilot import telemetry
+from mavsitl_vehicle.autopilot import commands, modes, plan, telemetry
+from mavsitl_vehicle.autopilot.commander import FAILSAFES, Action, Commander, Failsafe, Situation
+from mavsitl_vehicle.autopilot.modes import Control, Mode
 from mavsitl_vehicle.autopilot.parameters import TABLE, Parameter
+from mavsitl_vehicle.vehicle import Vehicle
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.typing import ExtensionMetadata
 
 from mavsitl import scenario
+from mavsitl.dialect import mavlink
+from mavsitl.ends import NullRecorder
 
 UNITS = {
     "hz": "Hz",
@@ -255,6 +266,312 @@ def rate(hz: float) -> str:
     return f"{hz:g}" if hz else "–"
 
 
+def enum_name(enum: str, value: int) -> str:
+    """The entry without its enumeration's name before it."""
+    return str(mavlink.enums[enum][value].name).removeprefix(f"{enum}_")
+
+
+class Commands(GeneratedDirective):
+    """`commands.TABLE`."""
+
+    def run(self) -> list[nodes.Node]:
+        rows = [
+            [self.code(enum_name("MAV_CMD", command)), self.text(f"{command}"), self.text(row.text)]
+            for command, row in sorted(commands.TABLE.items())
+        ]
+        return [self.table(("command", "id", "what it does here"), rows)]
+
+
+class MissionCommands(GeneratedDirective):
+    """`plan.COMMANDS`."""
+
+    def run(self) -> list[nodes.Node]:
+        rows = []
+        skipped: list[nodes.Node] = [nodes.Text("Accepted and skipped: ")]
+        for command, info in sorted(plan.COMMANDS.items()):
+            name = self.code(enum_name("MAV_CMD", command))
+            if info.effect is plan.Effect.SKIP:
+                skipped += [*name, nodes.Text(f" ({command}), ")]
+                continue
+            cells = (f"{command}", info.effect.value, info.place.value, info.params)
+            rows.append([name, *(self.text(cell) for cell in cells)])
+        skipped[-1] = nodes.Text(str(skipped[-1]).removesuffix(", ") + ".")
+        header = ("command", "id", "is", "position", "parameters looked at")
+        return [self.table(header, rows), nodes.paragraph("", "", *skipped)]
+
+
+class MessagesTaken(GeneratedDirective):
+    """What the autopilot and the services of a port take, asked of a vehicle."""
+
+    HOW: ClassVar[dict[str, str]] = {
+        "HEARTBEAT": "of a ground station: the link is not lost (`NAV_DLL_ACT`)",
+        "PING": "one for everybody is sent back, up to 200 a second",
+        "TIMESYNC": "a request is answered with the vehicle's clock, up to 200 a second",
+        "COMMAND_LONG": "by the table of commands",
+        "COMMAND_INT": "by the table of commands",
+        "SET_MODE": "as `DO_SET_MODE`, without an acknowledgement",
+        "SET_GPS_GLOBAL_ORIGIN": "refused with a text: the origin is the simulator's",
+        "SET_ATTITUDE_TARGET": "off-board: attitude or body rates, and thrust",
+        "SET_POSITION_TARGET_LOCAL_NED": "off-board, all masks, in frames 1, 7, 8 (velocity, acceleration) and 9",
+        "SET_POSITION_TARGET_GLOBAL_INT": "off-board, all masks, in frames 0, 3, 5, 6, 10 and 11",
+        "SET_ACTUATOR_CONTROL_TARGET": "off-board: torques and thrust of group 0; PX4 1.17 does not take it",
+        "MANUAL_CONTROL": "sticks; an axis that is not there (INT16_MAX) is left out",
+        "PARAM_REQUEST_READ": "by name or index; `_HASH_CHECK` by name",
+        "PARAM_REQUEST_LIST": "all, paced; a second one begins again",
+        "PARAM_SET": "answered by `PARAM_VALUE` on every link; a refused one also by `PARAM_ERROR`",
+        "MISSION_COUNT": "begins an upload; 0 clears",
+        "MISSION_ITEM_INT": "an item of an upload",
+        "MISSION_ITEM": "the same with float coordinates, for old clients",
+        "MISSION_REQUEST_LIST": "begins a download",
+        "MISSION_REQUEST_INT": "an item of a download",
+        "MISSION_REQUEST": "the same with float coordinates",
+        "MISSION_ACK": "ends a download",
+        "MISSION_CLEAR_ALL": "one plan or all three",
+        "MISSION_SET_CURRENT": "jumps to an item; answered by `MISSION_CURRENT`",
+        "MISSION_REQUEST_PARTIAL_LIST": "refused: `MAV_MISSION_UNSUPPORTED`",
+        "MISSION_WRITE_PARTIAL_LIST": "refused: `MAV_MISSION_UNSUPPORTED`",
+        "FILE_TRANSFER_PROTOCOL": "MAVLink FTP, all operations",
+        "LOG_REQUEST_LIST": "answered by `LOG_ENTRY`",
+        "LOG_REQUEST_DATA": "answered by `LOG_DATA`, paced",
+        "LOG_REQUEST_END": "ends the transfer",
+        "LOG_ERASE": "refused with a text",
+    }
+    """What becomes of each; to be as long as the vehicle's own list."""
+
+    def run(self) -> list[nodes.Node]:
+        flight = scenario.load("takeoff-hover")
+        vehicle = Vehicle(flight, NullRecorder(), seed=1, ports=("offboard", "gcs"), unix_us=lambda: 0)
+        taken = {*vehicle.autopilot.ports[0].message_ids, *vehicle.autopilot._handlers}
+        vehicle.close()
+        names = {message_id: str(mavlink.mavlink_map[message_id].msgname) for message_id in taken}
+        if set(names.values()) != set(self.HOW):
+            raise self.error(f"MessagesTaken.HOW and the vehicle differ: {set(names.values()) ^ set(self.HOW)}")
+        rows = [[self.code(names[key]), self.text(f"{key}"), self.text(self.HOW[names[key]])] for key in sorted(taken)]
+        return [self.table(("message", "id", "what becomes of it"), rows)]
+
+
+CONTROLS = {
+    Control.STICKS: "sticks",
+    Control.NAVIGATOR: "vehicle",
+    Control.STREAM: "program",
+    Control.NOBODY: "nobody",
+}
+
+
+class Read(dict[str, float]):
+    """Parameters at their defaults that note which of them were read."""
+
+    def __init__(self, **changes: float) -> None:
+        super().__init__({name: row.default for name, row in TABLE.items()} | changes)
+        self.names: list[str] = []
+
+    def __getitem__(self, name: str) -> float:
+        if name not in self.names:
+            self.names.append(name)
+        return super().__getitem__(name)
+
+
+WELL = Situation(landed=False, setpoint_age_us=0, sticks_age_us=0, gcs_age_us=0, mission_refusal=None)
+"""In the air, and everything there."""
+CAUSES: Mapping[str, Mapping[str, Any]] = {
+    "off-board signal lost": {"setpoint_age_us": None, "sticks_age_us": None},
+    "manual control lost": {"sticks_age_us": None},
+    "connection to ground station lost": {"gcs_age_us": None},
+    "low battery": {"battery_level": 1},
+    "critical battery": {"battery_level": 2},
+    "emergency battery level": {"battery_level": 3},
+    "geofence breached": {"fence_breach": "too far"},
+}
+"""What makes each fail-safe trip; who flies off-board has no sticks."""
+THRESHOLDS: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(CAUSES, ()),
+    "low battery": ("BAT_LOW_THR",),
+    "critical battery": ("BAT_CRIT_THR",),
+    "emergency battery level": ("BAT_EMERGEN_THR",),
+    "geofence breached": ("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST"),
+}
+"""Parameters by which others than the commander see what makes it trip: battery and fence."""
+LONG_US = 60_000_000
+"""Beyond COM_FAIL_ACT_T."""
+
+
+def flying(mode: Mode, parameters: Mapping[str, float]) -> Commander:
+    """A commander, armed and in the air, to which nothing has happened yet."""
+    commander = Commander(parameters, lambda severity, text: None)
+    commander.home_set = True
+    commander.step(0, WELL._replace(landed=True))
+    commander.request_arm(True, False, 0)
+    commander.step(0, WELL)
+    commander.request_mode(mode, "")
+    commander.step(0, WELL)
+    if commander.mode is not mode or not commander.armed:
+        raise AssertionError(f"the commander does not fly {mode}")
+    return commander
+
+
+class Modes(GeneratedDirective):
+    """`modes.TABLE`, and what the commander wants for each."""
+
+    def run(self) -> list[nodes.Node]:
+        rows = []
+        for mode, info in modes.TABLE.items():
+            commander = Commander(Read(), lambda severity, text: None)
+            # Landing is never refused, and a mode that nobody can ask for needs nothing.
+            needs = {
+                Control.STICKS: "sticks",
+                Control.STREAM: "setpoints",
+            }.get(info.control) or {Mode.MISSION: "mission", Mode.RTL: "home"}.get(mode)
+            if bool(needs) != bool(commander.cannot_fly(mode)):
+                raise self.error(f"{mode}: the commander wants {commander.cannot_fly(mode)!r}, the page says {needs!r}")
+            standard = enum_name("MAV_STANDARD_MODE", info.standard_mode) if info.standard_mode else ""
+            cells = (
+                info.title,
+                f"{info.main_mode}, {info.sub_mode}",
+                standard,
+                CONTROLS[info.control],
+                needs or "",
+                "yes" if info.can_arm else "no",
+                "yes" if info.selectable else "no",
+            )
+            rows.append([self.code(info.name), *(self.text(cell) for cell in cells)])
+        header = (
+            "mode",
+            "shown as",
+            "main, sub",
+            "standard mode",
+            "flown by",
+            "needs",
+            "can arm",
+            "can be chosen",
+        )
+        return [self.table(header, rows)]
+
+
+class Change(NamedTuple):
+    """Some modes become another without being asked."""
+
+    why: str
+    target: Mode
+    sources: tuple[Mode, ...]
+
+
+def changes() -> Iterator[Change]:
+    """What the commander does by itself, tried with each mode; a fail-safe with a value of its parameter that acts."""
+    yield Change("take-off height reached", Mode.LOITER, (Mode.TAKEOFF,))  # Autopilot.decide: commander.complete
+    ends: dict[Mode, list[Mode]] = {}
+    for mode in Mode:
+        commander = flying(mode, Read())
+        commander.request_arm(False, True, 0)
+        if commander.mode is not mode:
+            ends.setdefault(commander.mode, []).append(mode)
+    for target, sources in ends.items():
+        yield Change("disarmed", target, tuple(sources))
+    for row in FAILSAFES:
+        yield from failsafe_changes(row)
+
+
+def failsafe_changes(row: Failsafe) -> Iterator[Change]:
+    parameter, actions = by_value(row)
+    default = int(TABLE[parameter].default)
+    acting = [value for value, action in actions.items() if action > Action.WARN]
+    if not acting:
+        return
+    value = default if default in acting else acting[0]
+    found: dict[Mode, list[Mode]] = {}
+    for mode in Mode:
+        commander = flying(mode, Read(**{parameter: value}))
+        commander.situation = WELL._replace(**CAUSES[row.name])
+        tripped = row.tripped(commander)
+        for now_us in (1, LONG_US):
+            commander.step(now_us, commander.situation)
+        if tripped and commander.mode is not mode:
+            found.setdefault(commander.mode, []).append(mode)
+    for target, sources in found.items():
+        yield Change(f"{row.name} ({parameter} {value})", target, tuple(sources))
+
+
+def by_value(row: Failsafe) -> tuple[str, dict[int, Action]]:
+    """The parameter that decides on a fail-safe's action, and the action at each of its values."""
+    parameters = Read()
+    commander = flying(Mode.LOITER, parameters)
+    parameters.names.clear()
+    row.action(commander)
+    parameter = parameters.names[0]
+    return parameter, {
+        value: row.action(flying(Mode.LOITER, Read(**{parameter: value}))) for value in sorted(TABLE[parameter].values)
+    }
+
+
+class ModeChanges(GeneratedDirective):
+    """A line for each change: dots at the modes it leaves, an arrow at the one it leads to."""
+
+    LABEL, COLUMN, HEAD, ROW, DOT = 400, 46, 120, 30, 5
+
+    def run(self) -> list[nodes.Node]:
+        columns = {mode: self.LABEL + self.COLUMN * (0.5 + index) for index, mode in enumerate(modes.TABLE)}
+        found = list(changes())
+        height = self.HEAD + self.ROW * len(found) + 8
+        width = self.LABEL + self.COLUMN * len(columns) + 45
+        style = 'style="width: 100%; height: auto; font: 16px sans-serif" fill="currentColor" stroke="none"'
+        label = 'role="img" aria-label="Mode changes that nobody asked for"'
+        parts = [f'<svg viewBox="0 0 {width} {height}" {label} {style}>']
+        for mode, x in columns.items():
+            name = escape(modes.TABLE[mode].name)
+            parts.append(f'<text transform="translate({x - 3:g} {self.HEAD - 12}) rotate(-45)">{name}</text>')
+            parts.append(
+                f'<line x1="{x:g}" x2="{x:g}" y1="{self.HEAD - 6}" y2="{height - 8}" '
+                'stroke="currentColor" stroke-opacity="0.2"/>'
+            )
+        for index, change in enumerate(found):
+            parts.append(self.line(change, columns, self.HEAD + self.ROW * (index + 0.5)))
+        return [nodes.raw("", "\n".join([*parts, "</svg>"]), format="html")]
+
+    def line(self, change: Change, columns: Mapping[Mode, float], y: float) -> str:
+        target = columns[change.target]
+        sources = [columns[mode] for mode in change.sources]
+        span = [*sources, target]
+        parts = [
+            f'<text x="0" y="{y + 5:g}">{escape(change.why)}</text>',
+            f'<line x1="{min(span):g}" x2="{max(span):g}" y1="{y:g}" y2="{y:g}" stroke="currentColor"/>',
+            *(f'<circle cx="{x:g}" cy="{y:g}" r="{self.DOT}"/>' for x in sources),
+        ]
+        for side in {1 if x < target else -1 for x in sources}:
+            points = f"{target:g},{y:g} {target - 11 * side:g},{y - 5.5:g} {target - 11 * side:g},{y + 5.5:g}"
+            parts.append(f'<polygon points="{points}" fill="#c2410c"/>')
+        return "".join(parts)
+
+
+class Failsafes(GeneratedDirective):
+    """`commander.FAILSAFES`."""
+
+    def run(self) -> list[nodes.Node]:
+        if {row.name for row in FAILSAFES} != set(CAUSES):
+            raise self.error("CAUSES and commander.FAILSAFES name different fail-safes")
+        rows = []
+        for row in FAILSAFES:
+            parameter, actions = by_value(row)
+            names = (*self.looked_at(row, parameter, actions), *THRESHOLDS[row.name])
+            watched = ", ".join(f"`{name}`" for name in names)
+            does = ", ".join(f"{value}: {action.name.lower()}" for value, action in actions.items())
+            before = "`COM_FAIL_ACT_T` of holding before a return or landing" if row.deferred else "at once"
+            ends = "with its cause" if row.ends_with_cause else "by a mode change or disarming"
+            text = f"`{parameter}` (default {TABLE[parameter].default:g}): {does}"
+            rows.append([self.text(cell) for cell in (row.name, watched, text, before, ends)])
+        return [self.table(("fail-safe", "looks at", "does", "when", "ends"), rows)]
+
+    def looked_at(self, row: Failsafe, parameter: str, actions: Mapping[int, Action]) -> list[str]:
+        """The parameters that the row reads in any mode, besides the one that decides on the action."""
+        acting = max(actions, key=lambda value: actions[value] > Action.WARN)
+        names: dict[str, None] = {}
+        for mode in Mode:
+            parameters = Read(**{parameter: acting})
+            commander = flying(mode, parameters)
+            parameters.names.clear()
+            row.tripped(commander)
+            names |= dict.fromkeys(parameters.names)
+        return [name for name in names if name != parameter]
+
+
 class ParameterTables(GeneratedDirective):
     EFFECT: ClassVar[dict[str, str]] = {
         "now": "",
@@ -315,6 +632,12 @@ def setup(app: Sphinx) -> ExtensionMetadata:
     app.add_directive("shipped-scenarios", ShippedScenarios)
     app.add_directive("shipped-airframes", ShippedAirframes)
     app.add_directive("streams", Streams)
+    app.add_directive("commands", Commands)
+    app.add_directive("mission-commands", MissionCommands)
+    app.add_directive("messages-taken", MessagesTaken)
+    app.add_directive("modes", Modes)
+    app.add_directive("mode-changes", ModeChanges)
+    app.add_directive("failsafes", Failsafes)
     app.add_directive("parameter-tables", ParameterTables)
     app.add_directive("cli-help", CliHelp)
     return {"version": "1", "parallel_read_safe": True}

@@ -19,7 +19,7 @@ from mavsitl import __version__, cli, pair, scenario
 from mavsitl.cli import main
 from mavsitl.link.udp import LOOPBACK
 
-COMMANDS = ("fly", "vehicle", "ground", "report", "scenarios")
+COMMANDS = ("fly", "vehicle", "ground", "check", "report", "scenarios")
 
 HELP = {
     "fly": ("--seed", "--airframe", "--law", "--level", "--wind-information", "--duration", "--set", "--run-dir",
@@ -29,6 +29,8 @@ HELP = {
                 "--until-disarmed", "14580", "18570", "mavsitl vehicle hover-wind --instance 1"),
     "ground": ("--link", "--system", "--vehicle", "--lockstep", "--deadline", "--run-dir", "--wing", "--status",
                "udpin:127.0.0.1:14540", "mavsitl ground spiral-calm --link udpout:"),
+    "check": ("--listen", "--for", "--quiet", "--all", "--json", "14550", "14540", "18570", "Exit codes",
+              "udpout:HOST:PORT", "mavsitl check --listen tcp:127.0.0.1:5760"),
     "report": ("RUN", "run.json", "report.html"),
     "scenarios": ("--json",),
 }  # fmt: skip
@@ -86,9 +88,11 @@ def test_every_option_is_explained() -> None:
 def test_examples_in_the_help_are_accepted_by_the_parser() -> None:
     parser = cli.build_parser()
     examples = re.findall(
-        r"^  mavsitl (.+?)(?:  .*)?$", cli.FLY_EXAMPLES + cli.VEHICLE_EXAMPLES + cli.GROUND_EXAMPLES, re.M
+        r"^  mavsitl (.+?)(?:  .*)?$",
+        cli.FLY_EXAMPLES + cli.VEHICLE_EXAMPLES + cli.GROUND_EXAMPLES + cli.CHECK_EXAMPLES,
+        re.M,
     )
-    assert len(examples) >= 11
+    assert len(examples) >= 16
     for example in examples:
         assert callable(parser.parse_args(example.split()).run), example
 
@@ -141,6 +145,11 @@ MISTAKES: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "vehicle in real time": (["ground", "--vehicle", "127.0.0.1:1"], ("--vehicle", "only with --lockstep")),
     "deadline": (["ground", "--deadline", "nan"], ("--deadline", "'nan'", "finite number above 0")),
     "endpoint": (["ground", "--link", "serial:/dev/tty"], ("'serial:/dev/tty'", "udpin:HOST:PORT", "udpout:HOST:PORT")),
+    "check's endpoint": (["check", "--listen", "14550"], ("'14550'", "udpin:HOST:PORT", "tcp:HOST:PORT")),
+    "check's time": (["check", "--for", "0"], ("--for", "'0'", "finite number above 0")),
+    "lock-step over TCP": (
+        ["ground", "--lockstep", "--link", "tcp:127.0.0.1:5760"], ("--link tcp:127.0.0.1:5760", "udpin:HOST:PORT")
+    ),
     "wing": (["ground", "--wing", "kite", "--link", "udpin:127.0.0.1:0"], ("'kite'", "installed: paper")),
 }  # fmt: skip
 
