@@ -45,6 +45,8 @@ class Client:
         self.inbox: list[tuple[int, int, Any]] = []
         """(time us, port, message), oldest first."""
         self.wire: list[list[bytes]] = [[], []]
+        self.forwarded: list[tuple[int, Any]] = []
+        """(port, frame) of others' frames that the vehicle passed on."""
         self._sequence = 0
         self.vehicle.step(0)
         self._collect()
@@ -84,7 +86,9 @@ class Client:
             for datagram in self.vehicle.datagrams(port, combine=False):
                 self.wire[port].append(datagram)
                 (frame,) = parse(datagram)
-                assert (frame.system_id, frame.component_id) == (1, 1)
+                if (frame.system_id, frame.component_id) != (1, 1):
+                    self.forwarded.append((port, frame))
+                    continue
                 self.inbox.append((self.now_us, port, frame.message))
 
     def all(self, name: str, port: int | None = None, since_us: int = -1) -> list[Any]:

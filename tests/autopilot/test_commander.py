@@ -15,6 +15,7 @@ DENIED = mavlink.MAV_RESULT_DENIED
 
 HOLD_MODE = (MAIN_AUTO, SUB_LOITER)
 LAND_MODE = (MAIN_AUTO, SUB_LAND)
+RETURN_MODE = (MAIN_AUTO, 5)
 OFFBOARD_MODE = (MAIN_OFFBOARD, 0)
 FORCE = (21196.0, 2989.0)
 
@@ -74,7 +75,8 @@ def test_what_keeps_a_stream(client: Client, interval_s: float, kept: bool) -> N
     assert (client.flight_mode == OFFBOARD_MODE) == kept
 
 
-def test_stream_loss_lands_and_the_stream_brings_offboard_back(client: Client) -> None:
+def test_stream_loss_lands_and_the_stream_brings_offboard_back() -> None:
+    client = Client(flight(parameters={"COM_OBL_RC_ACT": 4}))
     client.climb(4.0)
     lost_us = client.now_us
     taken_s = client.run_until(lambda: client.flight_mode == LAND_MODE, 2.0)
@@ -112,11 +114,11 @@ def test_a_refused_mode_leaves_the_failsafe_on(client: Client) -> None:
     assert client.offboard() == REJECTED
     client.tick()
     assert client.critical
-    assert client.flight_mode == LAND_MODE
+    assert client.flight_mode == RETURN_MODE
 
 
 @pytest.mark.parametrize(
-    ("action", "mode"), [(0, LAND_MODE), (3, LAND_MODE), (4, LAND_MODE), (5, HOLD_MODE), (7, OFFBOARD_MODE)]
+    ("action", "mode"), [(0, RETURN_MODE), (3, RETURN_MODE), (4, LAND_MODE), (5, HOLD_MODE), (7, OFFBOARD_MODE)]
 )
 def test_action_on_loss(action: int, mode: tuple[int, int]) -> None:
     client = Client(flight(parameters={"COM_OBL_RC_ACT": action, "COM_OF_LOSS_T": 0.5}))
@@ -200,6 +202,9 @@ def test_auto_disarm_can_be_turned_off() -> None:
 def test_land_on_the_ground_does_not_stick(client: Client) -> None:
     assert client.land() == ACCEPTED
     client.tick()
+    assert client.flight_mode == LAND_MODE  # seen by who asked for it
+    assert client.arm() == REJECTED
+    client.run(1.1)
     assert client.flight_mode == HOLD_MODE
     assert client.arm() == ACCEPTED
 
@@ -220,7 +225,10 @@ def test_rotors_stand_until_they_have_spooled_up(client: Client) -> None:
 # --- modes
 
 
-@pytest.mark.parametrize(("main", "sub"), [(1, 0), (3, 0), (4, 5), (4, 0), (7, 0), (6, 3), (99, 1), (1 << 30, 0)])
+@pytest.mark.parametrize(
+    ("main", "sub"),
+    [(0, 0), (2, 1), (3, 1), (3, 2), (4, 1), (4, 8), (8, 0), (10, 0), (6, 3), (99, 1), (1 << 30, 0)],
+)
 def test_modes_that_it_has_not(client: Client, main: int, sub: int) -> None:
     assert client.mode(main, sub) == DENIED
     client.tick()
@@ -228,11 +236,33 @@ def test_modes_that_it_has_not(client: Client, main: int, sub: int) -> None:
     assert client.texts()[-1] == f"Mode refused: main {main} sub {sub} is not available"
 
 
-@pytest.mark.parametrize("params", [(0, 6, 0), (nan, 6, 0), (1, nan, 0), (1, 6.5, 0)])
-def test_mode_command_needs_its_parameters(client: Client, params: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(
+    ("params", "text"),
+    [
+        ((0, 6, 0), "base mode 0 is not available"),
+        ((nan, 6, 0), "param1 is nan, need MAV_MODE_FLAG bits"),
+        ((300, 6, 0), "param1 is 300, need MAV_MODE_FLAG bits"),
+        ((1, nan, 0), "param2 is nan, need PX4's main mode"),
+        ((1, 6.5, 0), "param2 is 6.5, need PX4's main mode"),
+    ],
+)
+def test_mode_command_needs_its_parameters(client: Client, params: tuple[float, ...], text: str) -> None:
     assert client.result(mavlink.MAV_CMD_DO_SET_MODE, *params) == DENIED
     client.tick()
-    assert client.texts() == ["Mode refused: param1 needs bit 0 (custom mode), param2 PX4's main mode"]
+    assert client.texts() == [f"Mode refused: {text}"]
+
+
+@pytest.mark.parametrize(
+    ("base_mode", "mode"), [(4, (4, 4)), (8 | 64, (3, 0)), (16 | 64, (7, 0)), (64, (1, 0)), (4 | 64, (4, 4))]
+)
+def test_base_mode_alone_means_what_it_means_to_px4(client: Client, base_mode: int, mode: tuple[int, int]) -> None:
+    assert client.result(mavlink.MAV_CMD_DO_SET_MODE, base_mode, 0, 0) == ACCEPTED
+    client.tick()
+    assert client.flight_mode == mode
+    client.hold()
+    assert client.acks_of(mavlink.MAVLink_set_mode_message(1, base_mode, 0)) == []
+    client.tick()
+    assert client.flight_mode == mode
 
 
 def test_set_mode_message_has_no_ack(client: Client) -> None:

@@ -86,7 +86,9 @@ def test_hold_out_of_a_landing_stays_where_it_was_asked_for(client: Client) -> N
     assert height_m < 2.8
     client.hold()
     client.run(8.0)
-    assert client.truth[2] == pytest.approx(height_m, abs=0.3)
+    # It brakes: 0.7 to 1.5 m/s within the jerk and acceleration of automatic flight.
+    assert height_m - 0.5 < client.truth[2] <= height_m
+    assert abs(client.truth[5]) < 0.01
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

@@ -36,6 +36,7 @@ from mavsitl_vehicle.autopilot.telemetry import (
     request,
 )
 
+from mavsitl import __version__
 from mavsitl.codec import parse
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector
@@ -172,7 +173,8 @@ def test_autopilot_version() -> None:
     assert m.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     assert m.uid & 0xFF == 7
     assert bytes(m.uid2[:8]) == m.uid.to_bytes(8, "big")
-    assert bytes(m.flight_custom_version) == b"mavsitl\0"
+    major, minor, patch = map(int, __version__.split("."))
+    assert bytes(m.flight_custom_version) == bytes((patch, minor, major, 0, 0, 0, 0, 0))
 
 
 def test_available_modes() -> None:

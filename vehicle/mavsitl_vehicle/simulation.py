@@ -9,7 +9,7 @@ import numpy as np
 
 from mavsitl import seeds
 from mavsitl.frames import Vector
-from mavsitl.quaternion import conjugate, rotate
+from mavsitl.quaternion import conjugate, rotate, to_euler
 from mavsitl.scenario import DrydenMil, Flight, Steady, Wind
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot.parameters import Parameters
@@ -86,6 +86,15 @@ class Simulation:
     def put_back(self) -> None:
         """At rest at the start pose, rotors still; time, wind and sensors go on."""
         self.x[:] = self._start
+
+    def set_upright(self) -> None:
+        """Level and at rest where it lies, with the heading it has, rotors still."""
+        for j in range(self.n):
+            w, x, y, z = self.x[6:10, j].tolist()
+            yaw_rad = to_euler((w, x, y, z))[2]
+            here: Vector = tuple(self.x[0:3, j].tolist())
+            self.x[:, j] = initial_state(here, yaw_rad, 0.0, 1)[:, 0]
+        self._measure()
 
     def set_parameter(self, name: str) -> None:
         """Take up a parameter that was changed in flight; those that are none of the simulation's change nothing."""

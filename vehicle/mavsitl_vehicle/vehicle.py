@@ -135,7 +135,9 @@ class Vehicle:
             lockstep=self._lockstep, unix_boot_us=unix_us,
         )  # fmt: skip
         autopilot.estimate = self.simulation.estimate[:, 0].tolist()
-        if self._lockstep:
+        if not self._lockstep:
+            autopilot.set_home_here()  # MAVSDK asks for it as soon as it hears the vehicle
+        else:
             for port in autopilot.ports:
                 for message_id in _STATE_MESSAGES[self._flight.scenario.controller.telemetry]:
                     port.schedule.set_interval(message_id, self.period_us, 0)
@@ -240,8 +242,13 @@ class Vehicle:
             self.autopilot.released_us = None
 
     def _reboot(self, now_us: int) -> None:
-        """PREFLIGHT_REBOOT_SHUTDOWN: clock, links and autopilot begin anew; the vehicle stays where it stands."""
+        """PREFLIGHT_REBOOT_SHUTDOWN: clock, links and autopilot begin anew; the vehicle stays where it stands.
+
+        One that has fallen over is set upright there.
+        """
         old = self.autopilot
+        if not old.health.upright and old.on_ground:
+            self.simulation.set_upright()
         self._boot_us = now_us
         self.autopilot = self._boot(now_us)
         self.autopilot.held = old.held

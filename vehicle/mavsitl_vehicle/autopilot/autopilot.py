@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot, inf, isfinite, nan, radians
+from math import cos, hypot, inf, isfinite, nan, radians
 from typing import Protocol
 
 from mavsitl.codec import Frame, Message
@@ -12,12 +12,12 @@ from mavsitl.frames import Vector
 from mavsitl.geodesy import Origin
 from mavsitl.routing import Router
 from mavsitl.scenario import Flight
-from mavsitl.services.mission import FENCE, MISSION
+from mavsitl.services.mission import FENCE, MISSION, RALLY
 from mavsitl.services.statustext import TextLimiter, chunks
 from mavsitl_vehicle.autopilot import commands, modes, plan, setpoints, telemetry
 from mavsitl_vehicle.autopilot.battery import Battery, Level
 from mavsitl_vehicle.autopilot.battery import settings as battery_settings
-from mavsitl_vehicle.autopilot.commander import Commander, Situation
+from mavsitl_vehicle.autopilot.commander import ACCEPTED, Commander, Situation
 from mavsitl_vehicle.autopilot.course import MissionCourse
 from mavsitl_vehicle.autopilot.fence import NO_LIMITS, Fence, FenceLimits
 from mavsitl_vehicle.autopilot.health import Health, summary
@@ -26,7 +26,7 @@ from mavsitl_vehicle.autopilot.navigator import Navigator
 from mavsitl_vehicle.autopilot.parameters import Parameters
 from mavsitl_vehicle.autopilot.pilot import Pilot
 from mavsitl_vehicle.autopilot.plan import FeasibilityContext
-from mavsitl_vehicle.autopilot.ports import Port, Shared
+from mavsitl_vehicle.autopilot.ports import Port, Shared, component_metadata
 from mavsitl_vehicle.autopilot.position import PositionControl
 from mavsitl_vehicle.autopilot.setpoints import (
     AttitudeSetpoint,
@@ -50,6 +50,8 @@ LANDING_TIME_US = 300_000
 LANDING_FILTER_S = 0.3
 LIFT_MARGIN_M = 0.1
 """An off-board position so far above the vehicle asks to leave the ground."""
+UPRIGHT_TILT_RAD = radians(60.0)
+"""PX4's FD_FAIL_R and FD_FAIL_P: beyond this the vehicle has fallen over."""
 LOOK_US = 12_000
 """So often the commander decides (PX4's: every 10 ms). A command, or a stream that returns, makes it look at once."""
 HOUSEKEEPING_US = 100_000
@@ -100,8 +102,6 @@ class Autopilot:
         self.parameters = parameters
         self.body = body
         self.plan = shared.plan
-        self.metadata = None
-        """The dialect has no COMPONENT_METADATA."""
         self.commander = Commander(parameters, self.queue_text)
         self.estimate: list[float] = [0.0] * 6 + [1.0] + [0.0] * 6
         """Position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s: what telemetry says."""
@@ -109,6 +109,7 @@ class Autopilot:
         start = scenario.start
         self.origin = Origin(start.latitude_deg, start.longitude_deg, start.altitude_amsl_m)
         self.home: Home | None = None
+        self._home_moved = False
         self.battery = Battery(airframe, battery_settings(parameters))
         self.held = start.clamp
         self.released_us: int | None = None
@@ -124,6 +125,7 @@ class Autopilot:
         self.wind: telemetry.Wind | None = None
         """As estimated; None: not known."""
         self.health = Health()
+        self._health_refusal: str | None = None
         self.attitude_setpoint: Setpoint | None = None
         """What the inner loops follow."""
         self.position_setpoint: PositionSetpoint | None = None
@@ -141,6 +143,8 @@ class Autopilot:
         """The mode flown in the last period; None: disarmed."""
         self._control = Control.NOBODY
         """Who makes the setpoints of that mode."""
+        self._halted = False
+        """A fail-safe holds the vehicle."""
         self._cascade = False
         """The position cascade flew in the last period."""
         self._lift_us: int | None = None
@@ -158,6 +162,7 @@ class Autopilot:
         self._housekept_us = -HOUSEKEEPING_US
         self.mission_refusal: str | None = "no mission"
         self._fence_breach: str | None = None
+        self._rally_seen: tuple[int, Home | None] | None = None
         self._fence = Fence((), self.origin)
         self._fence_id = 0
         self._mission_seen: tuple[object, ...] = ()
@@ -280,14 +285,19 @@ class Autopilot:
 
     def breach_at(self, x_m: float, y_m: float, z_m: float) -> str | None:
         """Why the fence would not allow this position (NaN: the vehicle's); None where it would, or acts not at all."""
+        self._refresh_plan()
         if self.parameters["GF_ACTION"] <= 0:
             return None
         x, y, z = (a if isfinite(a) else b for a, b in zip((x_m, y_m, z_m), self.estimate[:3], strict=True))
         return self._breach(x, y, z)
 
-    def request_mode(self, mode: Mode | None, described: str, now_us: int) -> int:
+    def request_mode(self, mode: Mode | None, described: str, now_us: int, *, stop: bool = True) -> int:
+        """The MAV_RESULT. Hold, asked for while holding, ends a DO_REPOSITION under way, unless `stop` is False."""
         self.look(now_us)
-        return self.commander.request_mode(mode, described)
+        result = self.commander.request_mode(mode, described)
+        if stop and result == ACCEPTED and mode is Mode.LOITER is self._flown:
+            self.navigator.hold()
+        return result
 
     def jump_to(self, sequence: int) -> bool:
         return self.plan.jump_to(sequence)
@@ -305,8 +315,7 @@ class Autopilot:
     def _set_home(self, position_nwu_m: Vector, yaw_rad: float) -> None:
         self.home = self.navigator.home = Home(position_nwu_m, yaw_rad, self._now_us)
         self.commander.home_set = True
-        for port in self.ports if not self.lockstep else ():
-            telemetry.request(self, port.node, mavlink.MAVLINK_MSG_ID_HOME_POSITION, 0, self._now_us)
+        self._home_moved = True
 
     # --- texts -------------------------------------------------------------------------------------------------------
 
@@ -329,6 +338,10 @@ class Autopilot:
         self.queue_text(mavlink.MAV_SEVERITY_INFO, text)
 
     # --- what telemetry shows ----------------------------------------------------------------------------------------
+
+    @property
+    def metadata(self) -> telemetry.Metadata:
+        return component_metadata()
 
     @property
     def landed_state(self) -> int:
@@ -400,7 +413,7 @@ class Autopilot:
                 None if sticks_us is None else now_us - sticks_us,
                 None if gcs_us is None else now_us - gcs_us,
                 self.mission_refusal,
-                None if was_armed else summary(self.health),
+                None if was_armed else self._health_refusal,
                 int(self.battery.level),
                 self._fence_breach,
             ),
@@ -418,8 +431,12 @@ class Autopilot:
                 self._stand_down(now_us)
             return None
         mode = commander.mode
+        halted = commander.failsafe and mode is Mode.LOITER
         if mode is not self._flown:
             self._switch(mode, now_us)
+        elif halted and not self._halted:
+            self.navigator.hold()  # on its way somewhere, by DO_REPOSITION
+        self._halted = halted
         control = self._control
         if control is Control.STREAM:
             setpoint = self._follow_stream(now_us)
@@ -507,6 +524,7 @@ class Autopilot:
             self.navigator.leave()
             if control is Control.STICKS:
                 self.pilot.engage(mode, state)
+        self._cascade = False  # its next setpoint begins at the one that is flown
 
     def _arm(self, now_us: int) -> None:
         self.set_home_here()
@@ -531,13 +549,15 @@ class Autopilot:
         mode = modes.TABLE[self.commander.intended]
         self.health = Health(
             battery=self.battery.level < Level.CRITICAL,
+            upright=_upright(self.estimate[7], self.estimate[8]),
             home=self.home is not None,
             sticks=self.commander.sticks_fresh(),
             fence=bool(self._fence) and parameters["GF_ACTION"] > 0,
             fence_breached=self._fence_breach is not None and parameters["GF_ACTION"] > 0,
             position_needed=mode.control is not Control.STREAM,
-            mode_refusal=None,
         )
+        self._health_refusal = summary(self.health)
+        self.health = self.health._replace(mode_refusal=self.commander.mode_refusal())
 
     def _refresh_plan(self) -> None:
         """The fence on the local plane, and whether the mission could be flown; looked at when something changed."""
@@ -546,6 +566,12 @@ class Autopilot:
         if fence_id != self._fence_id:
             self._fence_id = fence_id
             self._fence = self.plan.fence(self.origin)
+        if (rally := (stores.id(RALLY), self.home)) != self._rally_seen:
+            self._rally_seen = rally
+            self.navigator.rally_nwu_m = tuple(
+                (*self.origin.to_local(point.latitude_deg, point.longitude_deg), self.height_of(point.altitude_amsl_m))
+                for point in self.plan.rally_points(self.home_altitude_amsl_m)
+            )
         fenced = p["GF_ACTION"] > 0
         limits = FenceLimits(p["GF_MAX_HOR_DIST"], p["GF_MAX_VER_DIST"]) if fenced else NO_LIMITS
         seen = (
@@ -631,11 +657,12 @@ class Autopilot:
         self._landed_state = ON_GROUND
 
     def report(self, now_us: int) -> None:
-        """Telemetry that is due, texts, and at once what changed: HEARTBEAT and EXTENDED_SYS_STATE are pushed."""
+        """Telemetry that is due, texts, and at once what changed: HEARTBEAT, EXTENDED_SYS_STATE, HOME_POSITION."""
         shown = (self.commander.mode, self.commander.armed, self.commander.failsafe, self.landed_state)
         changed = self._shown is not None and shown != self._shown
         self._shown = shown
         texts, self._texts = self._texts, []
+        home_moved, self._home_moved = self._home_moved and not self.lockstep, False
         for port in self.ports:
             node = port.node
             for text in texts:
@@ -647,6 +674,13 @@ class Autopilot:
                     telemetry.send_current_mode(self, node, now_us)
             port.step(now_us)
             port.schedule.run(self, node, now_us)
+            if home_moved:
+                telemetry.request(self, node, mavlink.MAVLINK_MSG_ID_HOME_POSITION, 0, now_us)
+
+
+def _upright(x: float, y: float) -> bool:
+    """Tilted by less than UPRIGHT_TILT_RAD, by the x and y of the attitude quaternion."""
+    return 1.0 - 2.0 * (x * x + y * y) > cos(UPRIGHT_TILT_RAD)
 
 
 def _asks_to_lift(setpoint: PositionSetpoint, state: State) -> bool:

@@ -131,15 +131,17 @@ class Commander:
         self._tripped: dict[str, tuple[int, Action]] = {}
         """Name of a row to (since us, the action reported)."""
         self._overridden: set[str] = set()
+        self._acting = False
 
     @property
     def failsafe(self) -> bool:
-        """A fail-safe, not the user, has set the mode."""
-        return self.mode is not self.intended
+        """A fail-safe, not the user, has set the mode, be it the one that the user had chosen."""
+        return self._acting
 
     def step(self, now_us: int, situation: Situation) -> None:
         self.situation = situation
         if self.armed:
+            self.sticks_at_arming |= self.sticks_fresh()  # PX4: optional only until they come
             self._watch_failsafes(now_us)
             self._watch_landing(now_us)
         else:
@@ -153,11 +155,15 @@ class Commander:
     def request_mode(self, mode: Mode | None, described: str) -> int:
         """DO_SET_MODE, SET_MODE and the commands that imply a mode. `mode` None: one that this vehicle does not have.
 
-        As on PX4 a disarmed vehicle takes any mode, an armed one only what it can fly; landing is never refused.
+        As on PX4 a disarmed vehicle takes any mode, an armed one only what it can fly; landing is never refused, except
+        after a termination.
         """
         if mode is None:
             self._report(mavlink.MAV_SEVERITY_WARNING, f"Mode refused: {described} is not available")
             return DENIED
+        if self.armed and self.mode is Mode.TERMINATION and mode is not Mode.TERMINATION:
+            self._report(mavlink.MAV_SEVERITY_WARNING, f"{modes.TABLE[mode].name} refused: flight terminated")
+            return TEMPORARILY_REJECTED
         reason = self.cannot_fly(mode) if self.armed and mode is not Mode.LAND else None
         if reason:
             self._report(mavlink.MAV_SEVERITY_WARNING, f"{modes.TABLE[mode].name} refused: {reason}")
@@ -199,6 +205,10 @@ class Commander:
 
     def arming_refusal(self) -> str | None:
         """Why the vehicle would not arm now; None when it would."""
+        return self.mode_refusal() or self.situation.health_refusal
+
+    def mode_refusal(self) -> str | None:
+        """As `arming_refusal`, the sensors' health left out."""
         info = modes.TABLE[self.intended]
         if not info.can_arm:
             return f"mode {info.name} does not allow arming"
@@ -206,7 +216,7 @@ class Commander:
             return self._stream_text()
         if self.intended is Mode.MISSION and self.situation.mission_refusal:
             return self.situation.mission_refusal
-        return self.situation.health_refusal
+        return "no connection to the ground station" if _gcs_lost(self) else None
 
     def cannot_fly(self, mode: Mode) -> str | None:
         """Why this vehicle, armed, cannot fly in `mode` now; None when it can."""
@@ -244,6 +254,8 @@ class Commander:
     # --- what goes on by itself --------------------------------------------------------------------------------------
 
     def _watch_failsafes(self, now_us: int) -> None:
+        if self.mode is Mode.TERMINATION:  # never clears: rotors that have stopped in the air do not start again
+            return
         worst = Action.NONE
         for row in FAILSAFES:
             if not row.tripped(self):
@@ -253,6 +265,8 @@ class Commander:
                 continue
             since_us = self._tripped.get(row.name, (now_us, _A.NONE))[0]
             action = self._possible(row.action(self))
+            if action is _A.RETURN and self.intended in (Mode.LAND, Mode.RTL):
+                action = _A.WARN  # PX4: a landing goes on, and a return does not stop to begin again
             if row.deferred and action in (_A.RETURN, _A.LAND):
                 hold_us = int(self.parameters["COM_FAIL_ACT_T"] * 1e6)
                 if now_us - since_us < hold_us:
@@ -265,8 +279,10 @@ class Commander:
             self._disarm("failsafe")
         elif worst in ACTION_MODES:
             self.mode = ACTION_MODES[worst]
+            self._acting = True
         elif not self._latched():
             self.mode = self.intended
+            self._acting = False
 
     def _announce(self, row: Failsafe, action: Action) -> None:
         if action is _A.NONE:
@@ -322,6 +338,7 @@ class Commander:
 
     def _choose(self, mode: Mode) -> None:
         self.intended = self.mode = mode
+        self._acting = False
         self._tripped = {name: known for name, known in self._tripped.items() if name not in self._overridden}
 
     def _disarm(self, by: str) -> None:

@@ -196,7 +196,7 @@ def _reposition(autopilot: Autopilot, command: Command, now_us: int, port: Port)
     z = autopilot.height_of(where.altitude_amsl_m)
     if reason := autopilot.breach_at(x, y, z):
         return _deny(autopilot, f"Reposition refused: {reason}")
-    result = autopilot.request_mode(Mode.LOITER, "hold", now_us)
+    result = autopilot.request_mode(Mode.LOITER, "hold", now_us, stop=False)
     if result == ACCEPTED:
         speed, yaw = command.params[0], command.params[3]
         autopilot.navigator.go_to(
@@ -298,9 +298,11 @@ def _set_mission_current(autopilot: Autopilot, command: Command, now_us: int, po
 
 
 def _set_message_interval(autopilot: Autopilot, command: Command, now_us: int, port: Port) -> int:
-    message_id, interval_us = command.integer(1), command.integer(2)
+    message_id, asked_us = command.integer(1), command.params[1]
     if message_id not in telemetry.BY_ID:
         return _deny(autopilot, f"Message interval refused: no stream of message {command.params[0]:g}")
+    # The field is a float: MAVSDK asks for 15 Hz by 66666.7 us.
+    interval_us = round(asked_us) if isfinite(asked_us) else None
     if interval_us is None or not -1 <= interval_us <= telemetry.MAX_INTERVAL_US:
         return _deny(
             autopilot, f"Message interval refused: {command.params[1]:g} us, need -1 to {telemetry.MAX_INTERVAL_US}"

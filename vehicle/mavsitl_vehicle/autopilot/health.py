@@ -47,6 +47,8 @@ class Health(NamedTuple):
     """No warning of BAT_CRIT_THR or worse."""
     attitude: bool = True
     """The attitude estimate is valid."""
+    upright: bool = True
+    """Not fallen over: what lies on its side cannot take off."""
     height: bool = True
     position: bool = True
     """The horizontal position estimate is valid."""
@@ -84,6 +86,7 @@ def refusals(health: Health) -> tuple[str, ...]:
         (health.barometer, "barometer fault"),
         (health.motors, "motor fault"),
         (health.attitude, "attitude estimate invalid"),
+        (health.upright, "fallen over, a reboot sets it upright"),
         (health.height, "height estimate invalid"),
         (health.position or not health.position_needed, "no valid position estimate"),
         (health.gps or not health.position_needed, "no GPS fix"),

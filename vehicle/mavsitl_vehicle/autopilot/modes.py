@@ -99,9 +99,10 @@ TABLE: dict[Mode, ModeInfo] = {
 }
 """In the order of PX4's nav_state, which is the order of AVAILABLE_MODES."""
 
-_BY_NUMBERS = {(info.main_mode, info.sub_mode): mode for mode, info in TABLE.items()}
+_SELECTABLE = {mode: info for mode, info in TABLE.items() if info.selectable}
+_BY_NUMBERS = {(info.main_mode, info.sub_mode): mode for mode, info in _SELECTABLE.items()}
 _BY_NUMBERS[4, 0] = Mode.MISSION  # PX4: AUTO without a sub mode
-_BY_STANDARD = {info.standard_mode: mode for mode, info in TABLE.items() if info.standard_mode}
+_BY_STANDARD = {info.standard_mode: mode for mode, info in _SELECTABLE.items() if info.standard_mode}
 
 
 def custom_mode(mode: Mode) -> int:
@@ -111,7 +112,7 @@ def custom_mode(mode: Mode) -> int:
 
 
 def find(main_mode: int, sub_mode: int) -> Mode | None:
-    """The mode that PX4's numbers name, or None where this vehicle has none of that kind."""
+    """The mode that PX4's numbers name, or None where a user cannot choose one of that kind."""
     return _BY_NUMBERS.get((main_mode, sub_mode))
 
 

@@ -77,6 +77,8 @@ class Navigator:
         self, parameters: Values, gravity_m_s2: float, period_s: float, course: Course, say: Callable[[str], None]
     ) -> None:
         self.home: Home | None = None
+        self.rally_nwu_m: tuple[Vector, ...] = ()
+        """Where a return may end besides home; the heights are the least of the way there."""
         self.landing = False
         """It descends to touch down: what the landing detector may believe."""
         self.finished: Mode | None = None
@@ -107,6 +109,8 @@ class Navigator:
         """Centre x, y, height, radius (negative: counter-clockwise seen from above), speed."""
         self._pending_orbit: tuple[tuple[float, float] | None, float, float, float] | None = None
         self._return = ReturnPhase.CLIMB
+        self._return_xy_m = (0.0, 0.0)
+        self._return_yaw_rad = nan
         self._wait_us = 0
 
     # --- what a command asks for, before or while its mode flies -----------------------------------------------------
@@ -331,14 +335,16 @@ class Navigator:
         self._speed = self._climb = self._sink = nan
 
     def begin_return(self, state: State) -> None:
-        """Climb to RTL_RETURN_ALT, go home, sink to RTL_DESCEND_ALT, wait RTL_LAND_DELAY, land."""
+        """Climb to RTL_RETURN_ALT, go to home or the nearest rally point, sink to RTL_DESCEND_ALT, wait, land."""
         home = self.home
         if home is None:
             self.descend()
             return
         x, y, z = state.position_nwu_m
-        away = hypot(x - home.position_nwu_m[0], y - home.position_nwu_m[1])
-        height = max(home.position_nwu_m[2] + self._return_height(away), z)
+        places = ((home.position_nwu_m, home.yaw_rad), *((rally, nan) for rally in self.rally_nwu_m))
+        (px, py, least), self._return_yaw_rad = min(places, key=lambda place: hypot(x - place[0][0], y - place[0][1]))
+        self._return_xy_m = px, py
+        height = max(home.position_nwu_m[2] + self._return_height(hypot(x - px, y - py)), least, z)
         self._return = ReturnPhase.CLIMB
         self._return_by((nan, nan, height))
 
@@ -361,7 +367,7 @@ class Navigator:
         home = self.home
         if home is None or self._return is ReturnPhase.LAND:
             return
-        hx, hy, hz = home.position_nwu_m
+        (hx, hy), hz = self._return_xy_m, home.position_nwu_m[2]
         x, y, z = state.position_nwu_m
         acceptance = self._parameters["NAV_ACC_RAD"]
         phase = self._return
@@ -371,7 +377,7 @@ class Navigator:
             self._return = ReturnPhase.CRUISE
         elif phase is ReturnPhase.CRUISE and self.reached(state, min(acceptance, 1.0)):
             lower = min(z, hz + self._parameters["RTL_DESCEND_ALT"])
-            self._return_by((hx, hy, lower), home.yaw_rad)
+            self._return_by((hx, hy, lower), self._return_yaw_rad)
             self._return = ReturnPhase.LOWER
         elif phase is ReturnPhase.LOWER and self.reached(state, acceptance):
             self._wait_us = now_us

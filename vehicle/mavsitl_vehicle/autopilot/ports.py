@@ -74,6 +74,12 @@ def _extras() -> dict[str, bytes]:
     return metadata.files()
 
 
+def component_metadata() -> telemetry.Metadata:
+    """What COMPONENT_METADATA says."""
+    name = f"/{metadata.GENERAL_URI.removeprefix('mftp://')}"
+    return telemetry.Metadata(metadata.GENERAL_URI, metadata.file_crc(_extras()[name]))
+
+
 def _extra(name: str) -> Any:
     """Made when it is first asked for: packing it takes longer than the rest of the start."""
     return lambda: _extras()[name]

@@ -381,6 +381,8 @@ def _middleware_version() -> int:
 
 
 _MIDDLEWARE_SW_VERSION = _middleware_version()
+_OWN_VERSION = _MIDDLEWARE_SW_VERSION.to_bytes(4, "little")[1:] + bytes(5)
+"""flight_custom_version: patch, minor, major, which clients show as the vendor's version, and no git hash."""
 
 
 def send_autopilot_version(subject: Subject, node: Node, now_us: int) -> bool:
@@ -388,7 +390,7 @@ def send_autopilot_version(subject: Subject, node: Node, now_us: int) -> bool:
     node.send(
         _AUTOPILOT_VERSION,
         CAPABILITIES, _FLIGHT_SW_VERSION, _MIDDLEWARE_SW_VERSION, 0, 0,
-        b"mavsitl\0", bytes(8), bytes(8), 0, 0, uid, uid.to_bytes(8, "big") + bytes(10),
+        _OWN_VERSION, bytes(8), bytes(8), 0, 0, uid, uid.to_bytes(8, "big") + bytes(10),
     )  # fmt: skip
     return True
 
@@ -1018,6 +1020,8 @@ _LOCKSTEP_HZ = {
 
 STAGGER_US = 250_000
 """By when every stream has begun."""
+_AT_ONCE = ("HEARTBEAT", "SYS_STATUS")
+"""What a client waits for: that the vehicle is there, and that it is ready to arm."""
 _GOLDEN = 0.618_033_988_749_895
 """Multiples of it, modulo 1, fill an interval evenly however many there are."""
 
@@ -1045,7 +1049,8 @@ class Schedule:
         for order, stream in enumerate(self._streams):
             interval_us = self._interval[stream.message_id]
             if interval_us != NEVER:
-                share = 0.0 if profile == "lockstep" else order * _GOLDEN % 1.0
+                at_once = profile == "lockstep" or stream.name in _AT_ONCE
+                share = 0.0 if at_once else order * _GOLDEN % 1.0
                 due_us = start_us + int(share * min(interval_us, STAGGER_US))
                 self._queue.append((due_us, order, interval_us, stream.send))
         heapify(self._queue)
