@@ -534,6 +534,8 @@ class MissionServer:
         transaction = self._running(sender)
         if transaction is not None:
             self._end(transaction)
+        if self._served is not None and self._served.peer == sender:
+            self._served = None
 
     def _watch(self, transaction: _Transaction, now_us: int) -> Sequence[Message]:
         if now_us - transaction.progress_us >= GIVE_UP_US:

@@ -59,3 +59,12 @@ def test_nothing_is_said_before_the_first_step() -> None:
     frames = [parse(datagram)[0] for datagram in vehicle.datagrams(GCS, combine=False)]
     assert [frame.sequence for frame in frames] == [(255 + n) & 0xFF for n in range(len(frames))]
     assert {"HEARTBEAT", "HOME_POSITION"} <= {frame.message.get_type() for frame in frames}
+
+
+def test_what_came_on_any_link_is_counted(client: Client) -> None:
+    reboot(client, OFFBOARD)
+    client.run(0.1)
+    reboot(client, GCS)
+    client.vehicle.receive(GCS, b"\xfd junk")
+    assert client.vehicle.counters.frames == 2
+    assert client.vehicle.counters.rejected == 1

@@ -655,6 +655,19 @@ def test_a_download_gives_way_when_its_last_item_is_out() -> None:
     assert item.x == waypoint(1).x
 
 
+def test_no_item_of_a_plan_that_is_gone_is_served() -> None:
+    """DroneKit asks for item 0 whatever the count is."""
+    bench = Bench()
+    bench.upload([waypoint(0)])
+    bench.say(mavlink.MAVLink_mission_request_list_message(*SERVER, MISSION))
+    bench.say(Request(*SERVER, 0, MISSION))
+    bench.say(Ack(*SERVER, ACCEPTED, MISSION))
+    assert result_of(bench.say(mavlink.MAVLink_mission_clear_all_message(*SERVER, MISSION))) == ACCEPTED
+    (count,) = bench.say(mavlink.MAVLink_mission_request_list_message(*SERVER, MISSION))
+    assert count.count == 0
+    assert result_of(bench.say(FloatRequest(*SERVER, 0, MISSION))) == INVALID_SEQUENCE
+
+
 def test_a_transaction_of_a_dead_link_does_not_last() -> None:
     bench = Bench()
     second = Bench(bench.stores)

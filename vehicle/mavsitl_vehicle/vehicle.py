@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mavsitl.codec import Counters
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector, flip_quaternion
 from mavsitl.log import topics
@@ -179,8 +180,8 @@ class Vehicle:
 
     @property
     def counters(self) -> Any:
-        """Frames received and refused, by reason, of the first port."""
-        return self.autopilot.ports[0].node.counters
+        """Frames received and refused, by reason, of all links."""
+        return sum((port.node.counters for port in self.autopilot.ports), Counters())
 
     def receive(self, port: int, datagram: bytes, at_us: int | None = None) -> int:
         """One datagram from a link; the number of valid frames in it.

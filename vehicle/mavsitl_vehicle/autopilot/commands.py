@@ -431,7 +431,7 @@ TABLE: dict[int, Row] = {
     _M.MAV_CMD_REQUEST_FLIGHT_INFORMATION: Row(
         _request_one(_M.MAVLINK_MSG_ID_FLIGHT_INFORMATION), "FLIGHT_INFORMATION"
     ),
-    _M.MAV_CMD_REQUEST_PROTOCOL_VERSION: Row(_request_one(300), "PROTOCOL_VERSION"),
+    _M.MAV_CMD_REQUEST_PROTOCOL_VERSION: Row(_request_one(300), "denied: the dialect has no PROTOCOL_VERSION"),
     _M.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: Row(_reboot, "disarmed only; clock and state begin anew, the sockets stay"),
     _M.MAV_CMD_PREFLIGHT_CALIBRATION: Row(_calibrate, "refused: simulated sensors need none"),
     _M.MAV_CMD_PREFLIGHT_STORAGE: Row(_storage, "2 and 4 reset the parameters; disarmed only"),
