@@ -152,6 +152,16 @@ class PacedClock:
             self.rebased += 1
         self.now_us = tick_us
 
+    def spare_s(self, tick_us: int) -> float:
+        """Wall time until `wait_until` would wait for `tick_us` awake, seconds; 0 or less when there is none."""
+        due_ns = self._origin_ns + round(tick_us * 1000 / self.speed)
+        return (due_ns - self._monotonic_ns() - SPIN_US * 1000) * 1e-9
+
+    def time_us(self) -> int:
+        """Simulated time by the wall clock, microseconds: from the tick last waited for up to just before the next."""
+        passed_us = int((self._monotonic_ns() - self._origin_ns) * self.speed) // 1000
+        return min(max(passed_us, self.now_us), self.now_us + self.period_us - 1)
+
     @property
     def real_time_factor(self) -> float:
         """Simulated over wall time since the start, lost time included; 0 before any time has passed."""

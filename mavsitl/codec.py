@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from operator import add
 from typing import Any, NamedTuple, TypeAlias
 
 from fastcrc import crc16
@@ -117,6 +118,9 @@ class Counters:
     """bytes that belong to no good frame"""
     unsupported: int = 0
     """good frames that no service handles; counted by whoever dispatches them, not here"""
+
+    def __add__(self, other: Counters) -> Counters:
+        return Counters(*map(add, astuple(self), astuple(other)))
 
     @property
     def rejected(self) -> int:

@@ -12,12 +12,16 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from mavsitl.clock import LatenessHistogram, PacedClock, monotonic_us
 from mavsitl.link.base import Link, LinkError, LinkSilent
+from mavsitl.link.sockets import wait_any
 from mavsitl.link.udp import ConnectedUdp
 from mavsitl.log.tlog import Direction, TlogWriter, WireHash
+
+if TYPE_CHECKING:
+    from mavsitl.check import Check
 
 FIRST_REPEAT_S = 0.1
 """Lock-step: the first datagram is repeated this often until the other side is there."""
@@ -26,6 +30,17 @@ MAX_OUT_OF_STEP = 1000
 PROGRESS_INTERVAL_US = 100_000
 """Wall clock between two calls of a progress callback."""
 FLUSH_INTERVAL_US = 1_000_000
+CHECK_WAIT_S, NO_SOCKET_WAIT_S = 0.02, 0.002
+"""Of a check: longest wait for a datagram; and a pause where there is nothing to wait for, a server not there yet."""
+
+TAKEN = 16
+"""Real time: datagrams taken from a link at a time, at most. With more it is first seen whether the tick is due."""
+WAKES = 32
+"""Real time: times within a tick that something may wake the vehicle; from then on it waits for the tick."""
+WAKE_S = 60e-6
+"""Real time: a wait for sockets ends so much later than the same sleep, and is cut by it."""
+GUARD_S = 0.0002
+"""Real time: what comes so shortly before a tick waits for it, and does not make it late."""
 
 
 class Core(Protocol):
@@ -48,6 +63,11 @@ class VehicleCore(Core, Protocol):
     @property
     def token_us(self) -> int:
         """Stamp that the newest setpoint echoes; -1 before the first."""
+
+
+class RealTimeVehicleCore(VehicleCore, Protocol):
+    def receive(self, port: int, datagram: bytes, at_us: int | None = None) -> int:
+        """`at_us`: when it came, from the last tick to just before the next; None: at the tick."""
 
 
 class GroundCore(Core, Protocol):
@@ -290,7 +310,7 @@ class RealTime:
 
 
 def run_realtime_vehicle(
-    vehicle: VehicleCore,
+    vehicle: RealTimeVehicleCore,
     links: Sequence[Link],
     tap: Tap,
     *,
@@ -298,31 +318,50 @@ def run_realtime_vehicle(
     until_finished: bool = False,
     stop: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
+    wait: Callable[[Sequence[Link], float], bool] = wait_any,
 ) -> RealTime:
-    """The vehicle on the wall clock, times `speed`. `links` in the order of its ports; peers join by a valid frame."""
+    """The vehicle on the wall clock, times `speed`. `links` in the order of its ports; peers join by a valid frame.
+
+    Physics, streams and decisions keep to the ticks. What comes between two of them is taken at once, and what the
+    services answer to it is sent at once. `wait` tells whether something came within a time in seconds.
+    """
     clock = PacedClock(vehicle.period_us, speed)
     clock.start()
     start_us = monotonic_us()
     throttle = _Throttle(progress)
     now_us = 0
-    while not stop() and not (until_finished and vehicle.finished):
-        vehicle.step(now_us)
+
+    def send() -> None:
         for port, link in enumerate(links):
             for datagram in vehicle.datagrams(port, combine=False):
                 if port == 0:
                     tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
                 link.send(datagram)
-        clock.wait_until(now_us + vehicle.period_us)
+
+    def take() -> None:
         for port, link in enumerate(links):
             wall_us = monotonic_us()  # peers expire on the wall clock, whatever the simulated one does
-            for datagram, source in link.receive(wall_us):
+            for datagram, source in link.receive(wall_us, TAKEN):
                 if port == 0:
                     tap.hear(Direction.FROM_GROUND, now_us, datagram)
-                if vehicle.receive(port, datagram):
+                if vehicle.receive(port, datagram, clock.time_us()):
                     link.admit(source, wall_us)
+
+    while not stop() and not (until_finished and vehicle.finished):
+        vehicle.step(now_us)
+        send()
+        next_us = now_us + vehicle.period_us
+        for _ in range(WAKES):
+            spare_s = clock.spare_s(next_us)
+            if spare_s <= GUARD_S or not wait(links, spare_s - WAKE_S) or clock.spare_s(next_us) <= GUARD_S:
+                break
+            take()
+            send()
+        clock.wait_until(next_us)
+        take()
         tap.tick(now_us)
         throttle(vehicle)
-        now_us += vehicle.period_us
+        now_us = next_us
     return RealTime(now_us, monotonic_us() - start_us, clock.lateness, clock.rebased)
 
 
@@ -360,3 +399,27 @@ def run_realtime_ground(
         tap.tick(now_us)
         throttle(ground)
     return (0, 0) if first is None else (last[0] - first[0], last[1] - first[1])
+
+
+def run_check(check: Check, links: Sequence[Link | None], duration_s: float) -> int:
+    """Listen for so long on the wall clock, or until Ctrl-C, which ends it early; the time of the report.
+
+    `links` in the order of the check's endpoints; None: that one is not open.
+    """
+    opened = [(port, link) for port, link in enumerate(links) if link is not None]
+    start_us = now_us = monotonic_us()
+    end_us = start_us + round(duration_s * 1e6) if opened else start_us
+    with contextlib.suppress(KeyboardInterrupt):
+        while now_us < end_us:
+            if not wait_any([link for _, link in opened], CHECK_WAIT_S):
+                opened[0][1].wait(NO_SOCKET_WAIT_S)
+            for port, link in opened:
+                for datagram, source in link.receive(now_us):
+                    if check.receive(port, datagram, source, monotonic_us() - start_us):
+                        link.admit(source, now_us)
+            check.step(now_us - start_us)
+            for port, link in opened:
+                for datagram in check.datagrams(port):
+                    link.send(datagram)
+            now_us = monotonic_us()
+    return now_us - start_us

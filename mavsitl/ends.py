@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 from mavsitl import __version__, drivers, wings
 from mavsitl.clock import monotonic_us, unix_us
 from mavsitl.drivers import Progress, Tap
+from mavsitl.herald import Herald
 from mavsitl.link.address import Address
-from mavsitl.link.base import Link
+from mavsitl.link.base import Link, LinkError
 from mavsitl.link.endpoint import open_link
 from mavsitl.link.tcp import TcpServerLink
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
-from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
+from mavsitl.log.errors import LogError
 from mavsitl.log.tlog import TlogWriter
-from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS, Topic
-from mavsitl.log.ulog import LogError, Recorder, UlogWriter
 from mavsitl.scenario import Flight
+
+if TYPE_CHECKING:
+    from mavsitl.check import Ear, Report, VehiclePort
+    from mavsitl.log.ulog import Recorder
 
 WIRE_LOG = "link.tlog"
 
@@ -54,29 +58,29 @@ class Outcome:
         return self.simulated_s / self.wall_s if self.wall_s > 0.0 else 0.0
 
 
-class _End(NamedTuple):
-    log_name: str
-    topics: tuple[Topic, ...]
-
-
-VEHICLE_END = _End(VEHICLE_LOG, VEHICLE_TOPICS)
-GROUND_END = _End(GROUND_LOG, GROUND_TOPICS)
+End = Literal["vehicle", "ground"]
 
 
 @contextmanager
-def _logs(folder: Path | None, end: _End, flight: Flight) -> Iterator[tuple[Recorder, Tap]]:
+def _logs(folder: Path | None, end: End, flight: Flight) -> Iterator[tuple[Recorder, Tap]]:
     """Recorder and tap of an end. Without a folder the rows are dropped as they come."""
     if folder is None:
         yield NullRecorder(), Tap()
         return
+    # Here, for they load numpy: a vehicle is heard before that.
+    from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
+    from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS
+    from mavsitl.log.ulog import UlogWriter
+
+    name, topics = (VEHICLE_LOG, VEHICLE_TOPICS) if end == "vehicle" else (GROUND_LOG, GROUND_TOPICS)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LogError(f"{folder}: no logs can be written there: {error.strerror or error}") from error
     info = {"sys_name": "mavsitl", "ver_sw": __version__, "scenario": flight.name}
     parameters = flight.airframe.parameters | flight.scenario.parameters
-    with UlogWriter(folder / end.log_name, info, parameters, topics=end.topics) as writer:
-        tlog = TlogWriter(folder / WIRE_LOG) if end is VEHICLE_END else None
+    with UlogWriter(folder / name, info, parameters, topics=topics) as writer:
+        tlog = TlogWriter(folder / WIRE_LOG) if end == "vehicle" else None
         try:
             yield writer, Tap(tlog=tlog, flush=writer.flush)
         finally:
@@ -137,7 +141,7 @@ def vehicle_lockstep(
         port_option="--offboard-port N", host_option="--bind HOST",
     )  # fmt: skip
     try:
-        with _logs(folder, VEHICLE_END, flight) as (recorder, tap):
+        with _logs(folder, "vehicle", flight) as (recorder, tap):
             build = wings.find(wings.VEHICLE_GROUP, wing)
             core = build(
                 flight, recorder, seed=flight.scenario.seed, system_id=system_id, ports=("offboard",), lockstep=True
@@ -163,7 +167,7 @@ def ground_lockstep(
         host_option="--link udpin:HOST:PORT",
     )
     try:
-        with _logs(folder, GROUND_END, flight) as (recorder, tap):
+        with _logs(folder, "ground", flight) as (recorder, tap):
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
@@ -199,13 +203,17 @@ def vehicle_realtime(
         )
         if links.tcp_port is not None:
             opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
-        with _logs(folder, VEHICLE_END, flight) as (recorder, tap):
-            build = wings.find(wings.VEHICLE_GROUP, wing)
-            core = build(
-                flight, recorder, seed=flight.scenario.seed, system_id=system_id,
-                ports=("offboard", *["gcs"] * (len(opened) - 1)), lockstep=False,
-                state=state, logs=folder, unix_us=_steady_unix_clock(), trusted=is_loopback(links.bind),
-            )  # fmt: skip
+        with ExitStack() as stack:
+            with Herald(wings.find_boot(wing), system_id, opened) as herald:
+                recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight))
+                build = wings.find(wings.VEHICLE_GROUP, wing)
+                core = build(
+                    flight, recorder, seed=flight.scenario.seed, system_id=system_id,
+                    ports=("offboard", *["gcs"] * (len(opened) - 1)), lockstep=False,
+                    state=state, logs=folder, unix_us=_steady_unix_clock(), trusted=is_loopback(links.bind),
+                )  # fmt: skip
+            if herald.sequence:
+                core.continue_from(herald.sequence)
             watch = _Watch(core)
             try:
                 timing = drivers.run_realtime_vehicle(
@@ -228,7 +236,7 @@ def ground_realtime(
     """The ground on the wall clock, on any endpoint. Raises as `vehicle_lockstep`."""
     link = open_link(address, port_option="--link udpin:HOST:PORT", host_option="--link udpin:HOST:PORT")
     try:
-        with _logs(folder, GROUND_END, flight) as (recorder, tap):
+        with _logs(folder, "ground", flight) as (recorder, tap):
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
@@ -243,8 +251,8 @@ def in_memory(
 ) -> Outcome:
     """Both ends in this process; the same bytes as in lock-step over UDP."""
     with (
-        _logs(folder, VEHICLE_END, flight) as (vehicle_recorder, tap),
-        _logs(folder, GROUND_END, flight) as (ground_recorder, ground_tap),
+        _logs(folder, "vehicle", flight) as (vehicle_recorder, tap),
+        _logs(folder, "ground", flight) as (ground_recorder, ground_tap),
     ):
         vehicle_flush, ground_flush = tap.flush, ground_tap.flush
 
@@ -273,6 +281,80 @@ def _steady_unix_clock() -> Callable[[], int]:
     """The system's clock as of now, which from here on does not jump with it."""
     offset_us = unix_us() - monotonic_us()
     return lambda: offset_us + monotonic_us()
+
+
+CHECKED_INSTANCES = 10
+"""Instances whose ports `check` looks at."""
+
+
+def check(endpoints: Sequence[Address] | None, *, duration_s: float, ask: bool) -> Report:
+    """Listen at the endpoints and say who is there; None: at the ports that PX4's vehicles send to, on loopback.
+
+    An endpoint that cannot be opened is in the report. In its stead, at PX4's ports, each vehicle port that somebody
+    has is called.
+    """
+    from mavsitl.check import Check
+
+    found = _vehicle_ports()
+    wanted = list(endpoints) if endpoints is not None else _default_endpoints()
+    ears: list[Ear] = []
+    links: list[Link | None] = []
+    try:
+        for address in wanted:
+            ear, link = _open_ear(address)
+            ears.append(ear)
+            links.append(link)
+            if endpoints is None and ear.taken and ask:
+                for held in found:
+                    if held.sends_to == address.port:
+                        ear, link = _open_ear(Address("udpout", LOOPBACK, held.port))
+                        ears.append(ear)
+                        links.append(link)
+        core = Check(ears, found, ask=ask)
+        return core.report(drivers.run_check(core, links, duration_s))
+    finally:
+        for opened in links:
+            if opened is not None:
+                opened.close()
+
+
+def _default_endpoints() -> list[Address]:
+    return [Address("udpin", LOOPBACK, port) for port in (GCS_REMOTE_PORT, OFFBOARD_REMOTE_PORT)]
+
+
+def _vehicle_ports() -> list[VehiclePort]:
+    from mavsitl.check import VehiclePort
+    from mavsitl.link.holders import holders
+
+    named = {}
+    for instance in range(CHECKED_INSTANCES):
+        named[GCS_PORT + instance] = (GCS_REMOTE_PORT, "--gcs-remote")
+        named[OFFBOARD_PORT + instance] = (OFFBOARD_REMOTE_PORT + instance, "--offboard-remote")
+    return [
+        VehiclePort(port=port, sends_to=named[port][0], option=named[port][1], holder=holder)
+        for port, holder in holders(named).items()
+    ]
+
+
+def _open_ear(address: Address) -> tuple[Ear, Link | None]:
+    from mavsitl.check import Ear
+    from mavsitl.link.holders import find_command, holders
+
+    speaks_first = address.kind in ("udpout", "tcp")
+    try:
+        link = open_link(address, port_option="--listen ENDPOINT", host_option="--listen ENDPOINT")
+    except LinkError as error:
+        taken = isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRINUSE
+        udp = address.kind == "udpin"
+        ear = Ear(
+            endpoint=str(address),
+            error=str(error),
+            taken=taken,
+            holder=holders([address.port]).get(address.port, "") if taken and udp else "",
+            find_holder=find_command(address.port) if taken and udp else "",
+        )
+        return ear, None
+    return Ear(endpoint=str(address), speaks_first=speaks_first), link
 
 
 class _Watch:

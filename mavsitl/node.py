@@ -89,6 +89,10 @@ class Node:
         self._frames_heard = 0
         self._outbox: list[bytes] = []
 
+    def continue_from(self, sequence: int) -> None:
+        """Let the next frame carry this sequence number, 0 to 255: others of this component were sent before."""
+        self._sequence = sequence & 0xFF
+
     def send(self, pack: Packer, *fields: object) -> None:
         """Queue one frame: `pack` is a function that `mavsitl.codec.packer` made, `fields` are its fields.
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache
+from importlib.metadata import entry_points
 from typing import Any, Literal
 
 Group = Literal["mavsitl.vehicle", "mavsitl.ground"]
+
+BOOT_GROUP = "mavsitl.boot"
+"""``heartbeat(sequence, system_id) -> frame`` of a vehicle, under its own name: what is sent while it is loaded."""
 
 VEHICLE_GROUP: Group = "mavsitl.vehicle"
 GROUND_GROUP: Group = "mavsitl.ground"
@@ -19,8 +23,20 @@ class WingError(LookupError):
 
 def find(group: Group, name: str | None = None) -> Any:
     """The `build` function of a wing: ``build(flight, recorder, **options) -> core``. No name: the shipped one."""
-    found: dict[str, EntryPoint] = {point.name: point for point in entry_points(group=group)}
+    found = {point.name: point for point in _installed().select(group=group)}
     wanted = name or _SHIPPED[group]
     if wanted not in found:
         raise WingError(f"{wanted!r} is not installed under {group}; installed: {', '.join(sorted(found)) or 'none'}")
     return found[wanted].load()
+
+
+def find_boot(name: str | None = None) -> Any | None:
+    """The HEARTBEAT of a vehicle wing that is still to be loaded; None where it has none."""
+    wanted = name or _SHIPPED[VEHICLE_GROUP]
+    return next((point.load() for point in _installed().select(group=BOOT_GROUP) if point.name == wanted), None)
+
+
+@cache
+def _installed() -> Any:
+    """Looking through everything that is installed takes longer than to load what is found."""
+    return entry_points()

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import socket
+from collections.abc import Sequence
 from typing import Protocol, TypeAlias
 
-__all__ = ["Link", "LinkError", "LinkSilent", "Source"]
+__all__ = ["MAX_RECEIVED", "Link", "LinkError", "LinkSilent", "Source"]
+
+MAX_RECEIVED = 256
+"""Datagrams in one `Link.receive`, so that a flood cannot hold the caller."""
 
 Source: TypeAlias = tuple[str | int, ...]
 """Where a datagram came from, as the link names it: for UDP the socket address, numeric host and port first."""
@@ -24,8 +29,11 @@ class Link(Protocol):
     The times passed in are microseconds of any clock that does not go back, the same one in every call.
     """
 
-    def receive(self, now_us: int) -> list[tuple[bytes, Source]]:
-        """What has come, oldest first; empty when nothing has. Does not wait. One call returns a bounded number."""
+    def receive(self, now_us: int, limit: int = MAX_RECEIVED) -> list[tuple[bytes, Source]]:
+        """What has come, oldest first, at most `limit`; empty when nothing has. Does not wait."""
+
+    def readers(self) -> Sequence[socket.socket]:
+        """Sockets of which one becomes readable when something comes; none where nothing can come during a wait."""
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until something can be received, at most `timeout_s` seconds; whether there is something."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import socket
 from collections import deque
+from collections.abc import Sequence
 
-from mavsitl.link.base import LinkError, Source
+from mavsitl.link.base import MAX_RECEIVED, LinkError, Source
 
 __all__ = ["MemoryLink", "memory_pair"]
 
@@ -30,12 +32,14 @@ class MemoryLink:
         self._peer: MemoryLink | None = None
         self._closed = False
 
-    def receive(self, now_us: int) -> list[tuple[bytes, Source]]:
-        """Everything that has come, oldest first. Raises `LinkError` after `close`."""
+    def receive(self, now_us: int, limit: int = MAX_RECEIVED) -> list[tuple[bytes, Source]]:
+        """What has come, oldest first, at most `limit`. Raises `LinkError` after `close`."""
         self._check_open()
-        received = list(self._inbox)
-        self._inbox.clear()
-        return received
+        return [self._inbox.popleft() for _ in range(min(limit, len(self._inbox)))]
+
+    def readers(self) -> Sequence[socket.socket]:
+        """None."""
+        return ()
 
     def wait(self, timeout_s: float) -> bool:
         """Whether something can be received. It returns at once: nothing can come while the only thread waits."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+import select
 import socket
+from collections.abc import Sequence
 from typing import Any
 
-from mavsitl.link.base import LinkError
+from mavsitl.link.base import Link, LinkError
 
-__all__ = ["LOOPBACK", "bind_socket", "resolve", "resolve_all", "show"]
+__all__ = ["LOOPBACK", "bind_socket", "resolve", "resolve_all", "show", "wait_any"]
 
 LOOPBACK = "127.0.0.1"
 
@@ -34,6 +36,15 @@ def show(address: Any) -> str:
     """A numeric socket address as text."""
     host, port = address[:2]
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def wait_any(links: Sequence[Link], timeout_s: float) -> bool:
+    """Wait until something may have come on one of the links, at most `timeout_s` seconds; whether it has.
+
+    It returns False at once where there is no socket to wait for.
+    """
+    readers = [reader for link in links for reader in link.readers()]
+    return bool(readers) and bool(select.select(readers, (), (), timeout_s)[0])
 
 
 def bind_socket(bind: tuple[str, int], family: int, kind: int, port_option: str, host_option: str) -> socket.socket:

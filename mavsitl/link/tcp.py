@@ -11,10 +11,11 @@ import os
 import select
 import socket
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 from mavsitl.clock import monotonic_us
-from mavsitl.link.base import LinkError, Source
+from mavsitl.link.base import MAX_RECEIVED, LinkError, Source
 from mavsitl.link.framing import StreamSplitter
 from mavsitl.link.sockets import LOOPBACK, bind_socket, resolve, resolve_all, show
 
@@ -32,7 +33,6 @@ RETRY_US = 1_000_000
 """Time from a failed or lost connection to the next attempt."""
 
 _SYSTEM_BUFFER_BYTES = 65_536
-_MAX_RECEIVED = 256  # datagrams in one call, so that a flood cannot hold the caller
 _READ_BYTES = 4096
 _MAX_READS = 4  # of each connection in one call
 _MAX_ACCEPTED = 16
@@ -153,11 +153,18 @@ class TcpServerLink:
         """The connected clients, in the order they came."""
         return tuple(self._clients)
 
-    def receive(self, now_us: int) -> list[tuple[bytes, Source]]:
-        """What has come, each client's oldest first; takes in new clients. Raises `LinkError` after `close`."""
+    def readers(self) -> Sequence[socket.socket]:
+        """The listening socket and those of the clients."""
+        return (self._listener, *(client.socket for client in self._clients.values()))
+
+    def receive(self, now_us: int, limit: int = MAX_RECEIVED) -> list[tuple[bytes, Source]]:
+        """What has come, each client's oldest first, at most `limit`; takes in new clients.
+
+        Raises `LinkError` after `close`.
+        """
         self._check_open()
         self._pump()
-        return [self._inbox.popleft() for _ in range(min(_MAX_RECEIVED, len(self._inbox)))]
+        return [self._inbox.popleft() for _ in range(min(limit, len(self._inbox)))]
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until a datagram is complete, at most `timeout_s` seconds; serves connections meanwhile.
@@ -213,7 +220,7 @@ class TcpServerLink:
                 self._let_go(client)
         reading = list(self._clients.values())
         for _ in range(_MAX_READS):
-            if not reading or len(self._inbox) >= _MAX_RECEIVED:
+            if not reading or len(self._inbox) >= MAX_RECEIVED:
                 break
             more: list[_Connection] = []
             for client in reading:
@@ -309,8 +316,15 @@ class TcpClientLink:
         """The server's socket address while there is a connection."""
         return None if self._connection is None else self._connection.source
 
-    def receive(self, now_us: int) -> list[tuple[bytes, Source]]:
-        """What has come, oldest first; connects again when it is time. Raises `LinkError` after `close`."""
+    def readers(self) -> Sequence[socket.socket]:
+        """The connection's socket; none without a connection."""
+        return () if self._connection is None else (self._connection.socket,)
+
+    def receive(self, now_us: int, limit: int = MAX_RECEIVED) -> list[tuple[bytes, Source]]:
+        """What has come, oldest first, at most `limit`; connects again when it is time.
+
+        Raises `LinkError` after `close`.
+        """
         self._check_open()
         self._pump()
         if self._connection is None and self._connecting is None:
@@ -319,7 +333,7 @@ class TcpClientLink:
             elif now_us >= self._retry_at_us:
                 self._retry_at_us = None
                 self._begin()
-        return [self._inbox.popleft() for _ in range(min(_MAX_RECEIVED, len(self._inbox)))]
+        return [self._inbox.popleft() for _ in range(min(limit, len(self._inbox)))]
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until a datagram is complete, at most `timeout_s` seconds. Raises `LinkError` after `close`."""
@@ -430,7 +444,7 @@ class TcpClientLink:
             self._lose("the server ended the connection")
             return
         for _ in range(_MAX_READS):
-            if len(self._inbox) >= _MAX_RECEIVED:
+            if len(self._inbox) >= MAX_RECEIVED:
                 break
             lives, again = connection.read(self._inbox)
             if not lives:

@@ -7,10 +7,11 @@ import select
 import socket
 import struct
 import sys
+from collections.abc import Sequence
 
 from mavsitl.clock import monotonic_us
 from mavsitl.codec import MAX_DATAGRAM_BYTES
-from mavsitl.link.base import LinkError, LinkSilent, Source
+from mavsitl.link.base import MAX_RECEIVED, LinkError, LinkSilent, Source
 from mavsitl.link.sockets import LOOPBACK, bind_socket, resolve, show
 
 __all__ = ["LOOPBACK", "ConnectedUdp", "UdpLink"]
@@ -19,7 +20,6 @@ MAX_PEERS = 8
 PEER_SILENCE_US = 10_000_000
 """A peer that has sent nothing valid for so long is fed no more."""
 
-_MAX_RECEIVED = 256  # datagrams in one call, so that a flood cannot hold the caller
 _READ_BYTES = MAX_DATAGRAM_BYTES + 1  # one more than the parser takes: a cut datagram is still seen to be too long
 
 
@@ -70,12 +70,19 @@ class UdpLink:
         """The admitted peers, in the order they came."""
         return tuple(self._peers)
 
-    def receive(self, now_us: int) -> list[tuple[bytes, Source]]:
-        """What has come, oldest first; drops peers silent for too long. Raises `LinkError` after `close`."""
+    def readers(self) -> Sequence[socket.socket]:
+        """The one socket."""
+        return (self._socket,)
+
+    def receive(self, now_us: int, limit: int = MAX_RECEIVED) -> list[tuple[bytes, Source]]:
+        """What has come, oldest first, at most `limit`; drops peers silent for too long.
+
+        Raises `LinkError` after `close`.
+        """
         self._check_open()
         self._expire(now_us)
         received: list[tuple[bytes, Source]] = []
-        for _ in range(_MAX_RECEIVED):
+        for _ in range(limit):
             try:
                 received.append(self._socket.recvfrom(_READ_BYTES))
             except BlockingIOError:

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
-from mavsitl.log.ulog import LogError
+from mavsitl.log.errors import LogError
 
 _STAMP = struct.Struct(">Q")
 _PREFIX = struct.Struct("<BI")

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from mavsitl.log.errors import LogError as LogError
 from mavsitl.log.topics import DATA_MESSAGE, TOPICS, Topic
 
 MAGIC = b"ULog\x01\x12\x35\x01"
@@ -23,10 +24,6 @@ FLUSH_PERIOD_US = 1_000_000
 _BUFFER_BYTES = 1 << 18
 _TEXT_BYTES = 4096
 _FLOAT_MAX = float(np.finfo(np.float32).max)
-
-
-class LogError(OSError):
-    """A log cannot be written or read; the message names the file and the reason."""
 
 
 class _Sink:

@@ -165,7 +165,9 @@ def _plan_id(items: Sequence[MissionItem]) -> int:
 def same_plan(first: Sequence[MissionItem], second: Sequence[MissionItem]) -> bool:
     """Whether two plans are equal item by item; NaN equals NaN."""
     return len(first) == len(second) and all(
-        _crc(one, 0) == _crc(other, 0) and one[0] == other[0] for one, other in zip(first, second, strict=True)
+        a == b or (a != a and b != b)
+        for one, other in zip(first, second, strict=True)
+        for a, b in zip(one, other, strict=True)
     )
 
 

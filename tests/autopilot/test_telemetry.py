@@ -173,7 +173,7 @@ def test_autopilot_version() -> None:
     assert m.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     assert m.uid & 0xFF == 7
     assert bytes(m.uid2[:8]) == m.uid.to_bytes(8, "big")
-    major, minor, patch = map(int, __version__.split("."))
+    major, minor, patch = (int(part) for part in __version__.split(".")[:3])
     assert bytes(m.flight_custom_version) == bytes((patch, minor, major, 0, 0, 0, 0, 0))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from math import inf, isnan, nan
 from typing import Any
@@ -801,3 +802,10 @@ def test_nonsense_never_raises_and_keeps_the_rules(said: list[tuple[Any, tuple[i
         for mission_type, limit in stores.limits.items():
             assert len(stores.items(mission_type)) <= limit
         assert stores.transaction is None or len(stores.transaction.buffer) < stores.transaction.count
+
+
+def test_nan_of_any_bits_is_the_same_plan() -> None:
+    (odd,) = struct.unpack("<f", struct.pack("<I", 0xFFC00001))
+    plan = [MissionItem(16, 5, 0.0, nan, 0.0, nan, 1, 2, 3.0, 1)]
+    assert same_plan(plan, [plan[0]._replace(param2=odd, param4=-nan)])
+    assert not same_plan(plan, [plan[0]._replace(param2=0.0)])
