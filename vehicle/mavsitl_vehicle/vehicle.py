@@ -7,18 +7,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mavsitl.codec import Counters
 from mavsitl.dialect import mavlink
-from mavsitl.frames import Vector, flip_quaternion
-from mavsitl.log import topics
-from mavsitl.log.block import Array, Block, ned
+from mavsitl.frames import Vector
+from mavsitl.log.block import Array
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
 from mavsitl.signing import EPOCH_UNIX_US, Signing, SigningMode, SigningState
 from mavsitl_vehicle import tick
-from mavsitl_vehicle.autopilot import modes
 from mavsitl_vehicle.autopilot.autopilot import Autopilot
 from mavsitl_vehicle.autopilot.battery import settings as battery_settings
 from mavsitl_vehicle.autopilot.modes import Mode
@@ -29,6 +25,7 @@ from mavsitl_vehicle.autopilot.seated import SeatedLaw
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint
 from mavsitl_vehicle.autopilot.storage import Store, keep_parameters
 from mavsitl_vehicle.autopilot.wind_estimate import WindEstimate
+from mavsitl_vehicle.record import Record
 from mavsitl_vehicle.simulation import Simulation
 
 PLAN_SCHEMA = 1
@@ -94,7 +91,7 @@ class Vehicle:
         self.parameters.subscribe(self._on_parameter)
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
-        self._record = _Record(recorder, flight, aboard=self._seated is not None)
+        self._record = Record(recorder, flight, aboard=self._seated is not None)
         self._now_us = -self.period_us
         self._boot_us = 0
         """The driver's time at which the autopilot booted last."""
@@ -175,7 +172,7 @@ class Vehicle:
     @property
     def flight_time_s(self) -> float:
         """Since the release; negative before it."""
-        released = self.autopilot.released_us
+        released = self.autopilot.land.released_us
         return -1.0 if released is None else (self._now_us - self._boot_us - released) / 1e6
 
     @property
@@ -201,10 +198,10 @@ class Vehicle:
         autopilot, simulation = self.autopilot, self.simulation
         now_us -= self._boot_us
         if not first and now_us:
-            simulation.held[0] = autopilot.held
+            simulation.held[0] = autopilot.land.held
             setpoint = autopilot.decide(now_us - self.period_us)
             simulation.set_demand(0, self._inner_law(setpoint))
-            released_us = autopilot.released_us
+            released_us = autopilot.land.released_us
             flown_s = -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
             simulation.advance(flown_s)
         autopilot.estimate = simulation.estimate[:, 0].tolist()
@@ -221,7 +218,7 @@ class Vehicle:
             if self._now_us - self._signing_us >= SIGNING_STORE_US:
                 self._signing_us = self._now_us
                 self._keep_signing(self._signing.unsaved())
-        if autopilot.released_us is not None and not autopilot.commander.armed:
+        if autopilot.land.released_us is not None and not autopilot.commander.armed:
             self._done = True
             self._after_flight()
 
@@ -238,9 +235,9 @@ class Vehicle:
         """Ready for the next: where the flight began in a clamp, the clamp takes the vehicle back."""
         if self._flight.scenario.start.clamp:
             self.simulation.put_back()
-            self.autopilot.put_back()
+            self.autopilot.land.put_back()
         if self.autopilot.on_ground:
-            self.autopilot.released_us = None
+            self.autopilot.land.released_us = None
 
     def _reboot(self, now_us: int) -> None:
         """PREFLIGHT_REBOOT_SHUTDOWN: clock, links and autopilot begin anew; the vehicle stays where it stands.
@@ -252,7 +249,7 @@ class Vehicle:
             self.simulation.set_upright()
         self._boot_us = now_us
         self.autopilot = self._boot(now_us)
-        self.autopilot.held = old.held
+        self.autopilot.land.held = old.land.held
         for port, before in zip(self.autopilot.ports, old.ports, strict=True):
             port.node = before.node  # the answer to the command is still in it, and clients count on with its numbers
             before.close()
@@ -277,7 +274,7 @@ class Vehicle:
             or self.autopilot.commander.mode is not Mode.OFFBOARD
         ):
             return setpoint
-        if self.autopilot.released_us is None:
+        if self.autopilot.land.released_us is None:
             law.reset()
         return law.update(setpoint, self.autopilot.setpoint_us or 0, self.simulation.estimate[:, 0])
 
@@ -323,74 +320,6 @@ _STATE_MESSAGES = {
     "odometry": (mavlink.MAVLINK_MSG_ID_ODOMETRY,),
     "split": (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED),
 }
-
-
-# vehicle_status.arming_state
-DISARMED, ARMED = 1, 2
-
-# Columns of the vehicle's log block.
-_TRUTH = slice(0, 17)
-_ESTIMATE = slice(17, 30)
-_WIND = slice(30, 33)
-_INNER = slice(33, 37)
-_THRUST = 37
-_WIDTH = 38
-
-
-class _Record:
-    """The vehicle's log: truth beside estimate every tick, states when they change."""
-
-    def __init__(self, recorder: Recorder, flight: Flight, aboard: bool) -> None:
-        """`aboard`: the nets are, so their weights are logged here."""
-        largest = flight.airframe.max_rotor_speed_rad_s
-        self._block = Block(
-            recorder,
-            _WIDTH,
-            (
-                (topics.LOCAL_POSITION_TRUTH, lambda v: np.hstack((ned(v[:, 0:3]), ned(v[:, 3:6])))),
-                (topics.ATTITUDE_TRUTH, lambda v: np.column_stack(flip_quaternion(*v[:, 6:10].T))),
-                (topics.ANGULAR_VELOCITY_TRUTH, lambda v: ned(v[:, 10:13])),
-                (topics.LOCAL_POSITION, lambda v: np.hstack((ned(v[:, 17:20]), ned(v[:, 20:23])))),
-                (topics.ATTITUDE, lambda v: np.column_stack(flip_quaternion(*v[:, 23:27].T))),
-                (topics.ANGULAR_VELOCITY, lambda v: ned(v[:, 27:30])),
-                (topics.WIND_TRUTH, lambda v: ned(v[:, _WIND])),
-                (topics.ACTUATOR_MOTORS, lambda v: v[:, 13:17] / largest),
-                (topics.ROTOR_STATUS, lambda v: np.column_stack((v[:, 13:17], v[:, 36]))),
-                (topics.RATES_SETPOINT, lambda v: np.column_stack((ned(v[:, 33:36]), _thrust_frd(v[:, _THRUST])))),
-            ),
-        )
-        self._weights = recorder.topic(topics.PIDNN_WEIGHTS) if aboard else None
-        self._status = recorder.topic(topics.VEHICLE_STATUS)
-        self._land = recorder.topic(topics.LAND_DETECTED)
-        self._last_status: tuple[bool, Mode, bool] | None = None
-        self._last_land: int | None = None
-
-    def write(self, now_us: int, vehicle: Vehicle) -> None:
-        simulation, autopilot = vehicle.simulation, vehicle.autopilot
-        row = self._block.row(now_us)
-        row[_TRUTH] = simulation.x[:, 0]
-        row[_ESTIMATE] = simulation.estimate[:, 0]
-        row[_WIND] = simulation.wind[:, 0]
-        row[_INNER] = simulation.inner[tick.RATE_SETPOINT : tick.SATURATED + 1, 0]
-        row[_THRUST] = simulation.demand[tick.THRUST, 0]
-        if self._weights is not None and vehicle.weights is not None:
-            self._weights.append(now_us, *vehicle.weights[:, :, 0].T.ravel().tolist())
-        commander = autopilot.commander
-        status = (commander.armed, commander.mode, commander.failsafe)
-        if status != self._last_status:
-            self._last_status = status
-            nav_state = modes.TABLE[commander.mode].nav_state
-            self._status.append(now_us, ARMED if commander.armed else DISARMED, nav_state, int(commander.failsafe))
-        landed = int(autopilot.released_us is None or autopilot.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND)
-        if landed != self._last_land:
-            self._last_land = landed
-            self._land.append(now_us, landed, landed)
-
-
-def _thrust_frd(thrust: Array) -> Array:
-    """PX4's thrust_body: (0, 0, -thrust), (k, 3)."""
-    zero = np.zeros_like(thrust)
-    return np.column_stack((zero, zero, -thrust))
 
 
 def build(flight: Flight, recorder: Recorder, **options: Any) -> Vehicle:

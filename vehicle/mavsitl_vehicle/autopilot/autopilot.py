@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, hypot, inf, isfinite, nan, radians
+from math import cos, inf, isfinite, nan, radians
 from typing import Protocol
 
 from mavsitl.codec import Frame, Message
@@ -12,20 +12,19 @@ from mavsitl.frames import Vector
 from mavsitl.geodesy import Origin
 from mavsitl.routing import Router
 from mavsitl.scenario import Flight
-from mavsitl.services.mission import FENCE, MISSION, RALLY
 from mavsitl.services.statustext import TextLimiter, chunks
-from mavsitl_vehicle.autopilot import commands, modes, plan, setpoints, telemetry
+from mavsitl_vehicle.autopilot import commands, modes, setpoints, telemetry
 from mavsitl_vehicle.autopilot.battery import Battery, Level
 from mavsitl_vehicle.autopilot.battery import settings as battery_settings
 from mavsitl_vehicle.autopilot.commander import ACCEPTED, Commander, Situation
 from mavsitl_vehicle.autopilot.course import MissionCourse
-from mavsitl_vehicle.autopilot.fence import NO_LIMITS, Fence, FenceLimits
 from mavsitl_vehicle.autopilot.health import Health, summary
+from mavsitl_vehicle.autopilot.landing import IN_AIR, LANDING, TAKING_OFF, LandDetector
 from mavsitl_vehicle.autopilot.modes import Control, Mode
 from mavsitl_vehicle.autopilot.navigator import Navigator
 from mavsitl_vehicle.autopilot.parameters import Parameters
 from mavsitl_vehicle.autopilot.pilot import Pilot
-from mavsitl_vehicle.autopilot.plan import FeasibilityContext
+from mavsitl_vehicle.autopilot.plan_watch import PlanWatch
 from mavsitl_vehicle.autopilot.ports import Port, Shared, component_metadata
 from mavsitl_vehicle.autopilot.position import PositionControl
 from mavsitl_vehicle.autopilot.setpoints import (
@@ -39,15 +38,6 @@ from mavsitl_vehicle.autopilot.setpoints import (
 from mavsitl_vehicle.autopilot.sticks import Axes
 from mavsitl_vehicle.autopilot.telemetry import AttitudeTarget, FlightTimes, Home
 
-TAKEOFF_THRUST_SHARE = 0.9
-"""Of the hover thrust: above it, a spooled-up vehicle on the ground counts as taking off."""
-LOW_THRUST_SHARE = 0.5
-"""Of the hover thrust: below it, a vehicle that rests on the ground has landed, whatever its mode."""
-LANDED_HEIGHT_M = 0.05
-LANDED_SPEED_M_S = 0.15
-AIRBORNE_HEIGHT_M = 0.15
-LANDING_TIME_US = 300_000
-LANDING_FILTER_S = 0.3
 LIFT_MARGIN_M = 0.1
 """An off-board position so far above the vehicle asks to leave the ground."""
 UPRIGHT_TILT_RAD = radians(60.0)
@@ -56,11 +46,6 @@ LOOK_US = 12_000
 """So often the commander decides (PX4's: every 10 ms). A command, or a stream that returns, makes it look at once."""
 HOUSEKEEPING_US = 100_000
 """Battery, fence, health: what needs no control period."""
-
-ON_GROUND: int = mavlink.MAV_LANDED_STATE_ON_GROUND
-IN_AIR: int = mavlink.MAV_LANDED_STATE_IN_AIR
-TAKING_OFF: int = mavlink.MAV_LANDED_STATE_TAKEOFF
-LANDING: int = mavlink.MAV_LANDED_STATE_LANDING
 
 
 class Body(Protocol):
@@ -111,9 +96,6 @@ class Autopilot:
         self.home: Home | None = None
         self._home_moved = False
         self.battery = Battery(airframe, battery_settings(parameters))
-        self.held = start.clamp
-        self.released_us: int | None = None
-        """When the clamp opened or the take-off began; the flight's time zero."""
         self.setpoint: Setpoint | PositionSetpoint | None = None
         """The newest off-board one."""
         self.setpoint_us: int | None = None
@@ -138,7 +120,7 @@ class Autopilot:
             parameters, self._gravity, period_s, MissionCourse(shared.plan, parameters, self), self._say
         )
         self.pilot = Pilot(parameters, self._gravity, self._hover_thrust, period_s)
-        self._landed_state = ON_GROUND
+        self.land = LandDetector(self._hover_thrust, period_s, clamped=start.clamp)
         self._flown: Mode | None = None
         """The mode flown in the last period; None: disarmed."""
         self._control = Control.NOBODY
@@ -153,20 +135,11 @@ class Autopilot:
         self._limiter = TextLimiter()
         self._now_us = 0
         self._shown: tuple[Mode, bool, bool, int] | None = None
-        self._still_since_us: int | None = None
-        self._smooth = (0.0, 0.0, 0.0, 0.0)
-        """Height and velocity for the landing detector, with the sensors' noise filtered out."""
-        self._smoothing = min(period_s / LANDING_FILTER_S, 1.0)
         self._gcs_us: int | None = None
         self._look_us = 0
         self._housekept_us = -HOUSEKEEPING_US
-        self.mission_refusal: str | None = "no mission"
+        self._plan_watch = PlanWatch(shared.plan, self.origin, parameters, lambda text: self.warn("mission", text))
         self._fence_breach: str | None = None
-        self._rally_seen: tuple[int, Home | None] | None = None
-        self._fence = Fence((), self.origin)
-        self._fence_id = 0
-        self._mission_seen: tuple[object, ...] = ()
-        self._mission_told = 0
         self._router = Router(len(port_names), (system_id, mavlink.MAV_COMP_ID_AUTOPILOT1))
         self.ports = tuple(Port(name, index, self, shared, lockstep=lockstep) for index, name in enumerate(port_names))
         self._handlers = {
@@ -256,8 +229,13 @@ class Autopilot:
     # --- what commands need ------------------------------------------------------------------------------------------
 
     @property
+    def mission_refusal(self) -> str | None:
+        """Why AUTO.MISSION would not fly; None when it would."""
+        return self._plan_watch.mission_refusal
+
+    @property
     def on_ground(self) -> bool:
-        return self._landed_state == ON_GROUND
+        return self.land.on_ground
 
     @property
     def altitude_amsl_m(self) -> float:
@@ -286,10 +264,10 @@ class Autopilot:
     def breach_at(self, x_m: float, y_m: float, z_m: float) -> str | None:
         """Why the fence would not allow this position (NaN: the vehicle's); None where it would, or acts not at all."""
         self._refresh_plan()
-        if self.parameters["GF_ACTION"] <= 0:
+        if not self._plan_watch.acts:
             return None
         x, y, z = (a if isfinite(a) else b for a, b in zip((x_m, y_m, z_m), self.estimate[:3], strict=True))
-        return self._breach(x, y, z)
+        return self._plan_watch.breach((x, y, z))
 
     def request_mode(self, mode: Mode | None, described: str, now_us: int, *, stop: bool = True) -> int:
         """The MAV_RESULT. Hold, asked for while holding, ends a DO_REPOSITION under way, unless `stop` is False."""
@@ -346,7 +324,7 @@ class Autopilot:
     @property
     def landed_state(self) -> int:
         """MAV_LANDED_STATE: in the air, with what the vehicle itself is about."""
-        state = self._landed_state
+        state = self.land.state
         if state == IN_AIR:
             if self.navigator.landing:
                 return LANDING
@@ -408,7 +386,7 @@ class Autopilot:
         self.commander.step(
             now_us,
             Situation(
-                self._landed_state == ON_GROUND,
+                self.land.on_ground,
                 None if setpoint_us is None else now_us - setpoint_us,
                 None if sticks_us is None else now_us - sticks_us,
                 None if gcs_us is None else now_us - gcs_us,
@@ -451,8 +429,8 @@ class Autopilot:
 
     def _follow_stream(self, now_us: int) -> Setpoint | None:
         setpoint = self.setpoint
-        on_ground = self._landed_state == ON_GROUND
-        if on_ground and not self.held and not self.commander.spooled_up(now_us):
+        on_ground = self.land.on_ground
+        if on_ground and not self.land.held and not self.commander.spooled_up(now_us):
             return None
         if not isinstance(setpoint, PositionSetpoint):
             self._cascade = False
@@ -466,7 +444,7 @@ class Autopilot:
 
     def _navigate(self, now_us: int) -> Setpoint | None:
         state = State.of(self.estimate)
-        on_ground = self._landed_state == ON_GROUND
+        on_ground = self.land.on_ground
         if on_ground:
             ready = self.commander.spooled_up(now_us)
             if ready:
@@ -482,7 +460,7 @@ class Autopilot:
 
     def _fly_by_sticks(self, mode: Mode, now_us: int) -> Setpoint | None:
         present = self.commander.sticks_fresh()
-        if self._landed_state == ON_GROUND:
+        if self.land.on_ground:
             lift = present and self.pilot.wants_lift(mode)
             if not (lift and self.commander.spooled_up(now_us)):
                 self._rest()
@@ -540,121 +518,43 @@ class Autopilot:
     def _keep_house(self, now_us: int) -> None:
         """What is looked at ten times a second: battery, fence, mission, health."""
         self._housekept_us = now_us
-        parameters, armed = self.parameters, self.commander.armed
         if self.home is None:
             self.set_home_here()
-        self.battery.update(self.body.rotor_speeds_rad_s, armed, HOUSEKEEPING_US / 1e6)
+        self.battery.update(self.body.rotor_speeds_rad_s, self.commander.armed, HOUSEKEEPING_US / 1e6)
         self._refresh_plan()
-        self._fence_breach = self._breach(*self.estimate[:3])
+        x, y, z = self.estimate[:3]
+        self._fence_breach = self._plan_watch.breach((x, y, z))
         mode = modes.TABLE[self.commander.intended]
         self.health = Health(
             battery=self.battery.level < Level.CRITICAL,
             upright=_upright(self.estimate[7], self.estimate[8]),
             home=self.home is not None,
             sticks=self.commander.sticks_fresh(),
-            fence=bool(self._fence) and parameters["GF_ACTION"] > 0,
-            fence_breached=self._fence_breach is not None and parameters["GF_ACTION"] > 0,
+            fence=self._plan_watch.fenced,
+            fence_breached=self._fence_breach is not None and self._plan_watch.acts,
             position_needed=mode.control is not Control.STREAM,
         )
         self._health_refusal = summary(self.health)
         self.health = self.health._replace(mode_refusal=self.commander.mode_refusal())
 
     def _refresh_plan(self) -> None:
-        """The fence on the local plane, and whether the mission could be flown; looked at when something changed."""
-        stores, p = self.plan.stores, self.parameters
-        fence_id = stores.id(FENCE)
-        if fence_id != self._fence_id:
-            self._fence_id = fence_id
-            self._fence = self.plan.fence(self.origin)
-        if (rally := (stores.id(RALLY), self.home)) != self._rally_seen:
-            self._rally_seen = rally
-            self.navigator.rally_nwu_m = tuple(
-                (*self.origin.to_local(point.latitude_deg, point.longitude_deg), self.height_of(point.altitude_amsl_m))
-                for point in self.plan.rally_points(self.home_altitude_amsl_m)
-            )
-        fenced = p["GF_ACTION"] > 0
-        limits = FenceLimits(p["GF_MAX_HOR_DIST"], p["GF_MAX_VER_DIST"]) if fenced else NO_LIMITS
-        seen = (
-            stores.id(MISSION), fence_id, fenced, limits, self.home, self.on_ground,
-            p["MIS_TKO_LAND_REQ"], p["MIS_DIST_1WP"], p["MIS_TAKEOFF_ALT"],
-        )  # fmt: skip
-        if seen == self._mission_seen:
-            return
-        self._mission_seen = seen
-        context = FeasibilityContext(
-            self.on_ground, self._global_home(), self.origin, self._fence if fenced else None, limits,
-            p["MIS_DIST_1WP"], int(p["MIS_TKO_LAND_REQ"]), p["MIS_TAKEOFF_ALT"],
-        )  # fmt: skip
-        findings = self.plan.feasibility(context)
-        fatal = next((finding.text for finding in findings if finding.fatal), None)
-        if stores.items(MISSION) and stores.id(MISSION) != self._mission_told:
-            self._mission_told = stores.id(MISSION)
-            for finding in findings[:3]:
-                self.warn("mission", f"Mission: {finding.text}")
-        self.mission_refusal = fatal
-
-    def _global_home(self) -> plan.Home | None:
-        if self.home is None:
-            return None
-        x, y, _ = self.home.position_nwu_m
-        return plan.Home(*self.origin.to_global(x, y), self.home_altitude_amsl_m)
-
-    def _breach(self, x_m: float, y_m: float, z_m: float) -> str | None:
-        if self.home is None:
-            return None
-        hx, hy, hz = self.home.position_nwu_m
-        limits = FenceLimits(self.parameters["GF_MAX_HOR_DIST"], self.parameters["GF_MAX_VER_DIST"])
-        breach = self._fence.breach(x_m, y_m, z_m - hz, hx, hy, limits)
-        return None if breach is None else breach.text
+        watch = self._plan_watch
+        watch.refresh(None if self.home is None else self.home.position_nwu_m, self.land.on_ground)
+        self.navigator.rally_nwu_m = watch.rally_nwu_m
 
     def observe(self, now_us: int) -> None:
         """After the physics, with the new estimate: is it on the ground, in the clamp, taking off, in the air?"""
-        commander = self.commander
-        share, e = self._smoothing, self.estimate
-        z, vx, vy, vz = self._smooth
-        self._smooth = (
-            z + share * (e[2] - z),
-            vx + share * (e[3] - vx),
-            vy + share * (e[4] - vy),
-            vz + share * (e[5] - vz),
-        )
-        if not commander.armed:
-            if self._landed_state != ON_GROUND and not self.held:
-                self._update_landed(now_us)
-            return
-        if self._landed_state == ON_GROUND:
-            setpoint = self.attitude_setpoint
-            thrust = setpoint.thrust if setpoint is not None else 0.0
-            if thrust >= TAKEOFF_THRUST_SHARE * self._hover_thrust and commander.spooled_up(now_us):
-                self._landed_state = IN_AIR if self.held else TAKING_OFF
-                self.held = False
-                self.released_us = now_us
-                self._still_since_us = None
-                self.flight_times = self.flight_times._replace(took_off_us=max(now_us, 1))
-        else:
-            self._update_landed(now_us)
-
-    def _update_landed(self, now_us: int) -> None:
-        z, vx, vy, vz = self._smooth
-        if z > AIRBORNE_HEIGHT_M:
-            self._landed_state = IN_AIR
-            self._still_since_us = None
-            return
-        still = z < LANDED_HEIGHT_M and abs(vz) < LANDED_SPEED_M_S and hypot(vx, vy) < LANDED_SPEED_M_S
         setpoint = self.attitude_setpoint
-        unloaded = setpoint is None or setpoint.thrust < LOW_THRUST_SHARE * self._hover_thrust
-        landing = self.navigator.landing or not self.commander.armed or unloaded
-        if not (still and landing):
-            self._still_since_us = None
-        elif self._still_since_us is None:
-            self._still_since_us = now_us
-        elif now_us - self._still_since_us >= LANDING_TIME_US:
-            self._landed_state = ON_GROUND
-
-    def put_back(self) -> None:
-        """The clamp has taken the vehicle again."""
-        self.held = True
-        self._landed_state = ON_GROUND
+        took_off = self.land.update(
+            now_us,
+            self.estimate,
+            0.0 if setpoint is None else setpoint.thrust,
+            armed=self.commander.armed,
+            ready=self.commander.spooled_up(now_us),
+            landing=self.navigator.landing,
+        )
+        if took_off:
+            self.flight_times = self.flight_times._replace(took_off_us=max(now_us, 1))
 
     def report(self, now_us: int) -> None:
         """Telemetry that is due, texts, and at once what changed: HEARTBEAT, EXTENDED_SYS_STATE, HOME_POSITION."""
