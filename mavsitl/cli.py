@@ -229,7 +229,7 @@ _SYSTEM = _whole(1, 255)
 def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("scenario")
     group.add_argument("--seed", type=int, metavar="N", help="seed of wind and noise (scenario key: seed)")
-    group.add_argument("--airframe", metavar="NAME", help="paper, realistic or a .toml file (airframe)")
+    group.add_argument("--airframe", metavar="NAME", help="paper, realistic, full-coupling or a .toml file (airframe)")
     group.add_argument("--law", choices=("pidnn", "pid"), help="attitude law (controller.law)")
     group.add_argument("--level", choices=("attitude", "body_rate", "torque"), help="command level (controller.level)")
     group.add_argument(
@@ -280,7 +280,7 @@ def _add_vehicle(commands: Any) -> None:
         "--system", type=_SYSTEM, metavar="ID", help="MAVLink system id, 1 to 255 (default: instance + 1)"
     )
     group.add_argument(
-        "--bind", default="127.0.0.1", metavar="HOST", help="local address of both links (default: 127.0.0.1)"
+        "--bind", default="127.0.0.1", metavar="HOST", help="local address of all links (default: 127.0.0.1)"
     )
     group.add_argument(
         "--offboard-port", type=_PORT, metavar="N", help="local port of the off-board link (default: 14580 + I)"
@@ -616,6 +616,13 @@ class _Status:
         sys.stdout.flush()
 
 
+def _check_effect(options: argparse.Namespace, end: str, names: Sequence[str]) -> None:
+    """Scenario options that this end does not look at. In lock-step both ends are given all of them."""
+    for name in names:
+        if getattr(options, name[2:].replace("-", "_")) is not None and not options.lockstep:
+            raise UsageError(f"{name}: has no effect on the {end}, give it to the other end")
+
+
 def _check_lockstep(
     options: argparse.Namespace, *, real_time_only: Sequence[str], lockstep_only: Sequence[str]
 ) -> None:
@@ -654,6 +661,7 @@ def _vehicle(options: argparse.Namespace) -> int:
         gcs_remote=_endpoint(options.gcs_remote or f"127.0.0.1:{ends.GCS_REMOTE_PORT}", "--gcs-remote"),
         tcp_port=options.tcp_port,
     )
+    _check_effect(options, "vehicle", ("--duration", "--wind-information"))
     _check_lockstep(
         options,
         real_time_only=(
@@ -694,6 +702,7 @@ def _ground(options: argparse.Namespace) -> int:
 
     flight = _load(options.scenario, _settings(options))
     address = parse_address(options.link)
+    _check_effect(options, "ground", ("--seed",))
     _check_lockstep(options, real_time_only=(), lockstep_only=("--deadline", "--cpu", "--vehicle"))
     status = _Status(options.status == "json")
     if options.lockstep:

@@ -48,6 +48,7 @@ class Core(Protocol):
 
     @property
     def finished(self) -> bool: ...
+
     @property
     def flight_time_s(self) -> float: ...
     @property

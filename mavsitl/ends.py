@@ -17,7 +17,6 @@ from mavsitl.herald import Herald
 from mavsitl.link.address import Address
 from mavsitl.link.base import Link, LinkError
 from mavsitl.link.endpoint import open_link
-from mavsitl.link.tcp import TcpServerLink
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
 from mavsitl.log.errors import LogError
 from mavsitl.log.tlog import TlogWriter
@@ -202,6 +201,8 @@ def vehicle_realtime(
             )
         )
         if links.tcp_port is not None:
+            from mavsitl.link.tcp import TcpServerLink
+
             opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
         with ExitStack() as stack:
             with Herald(wings.find_boot(wing), system_id, opened) as herald:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from math import pi
 
-INT8_MAX = 0x7F
 INT16_MAX = 0x7FFF
 INT32_MAX = 0x7FFF_FFFF
 UINT8_MAX = 0xFF
@@ -33,9 +32,9 @@ def deg_e7(angle_deg: float) -> int:
     return whole(angle_deg * 1e7, -INT32_MAX - 1, INT32_MAX)
 
 
-def from_deg_e7(angle: int) -> float:
-    """Degrees."""
-    return angle * 1e-7
+def from_deg_e7(angle: float) -> float:
+    """Degrees of a latitude or longitude."""
+    return angle / 1e7
 
 
 def millimetres(length_m: float) -> int:

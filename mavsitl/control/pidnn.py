@@ -16,7 +16,7 @@ How the printed slips are resolved (docs: explanation/pidnn):
 from __future__ import annotations
 
 import math
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -29,23 +29,6 @@ Derivative = Literal["rate", "difference"]
 YAW = 2
 TURN = 2.0 * math.pi
 UNLIMITED: Vector3 = (math.inf, math.inf, math.inf)
-
-
-class AttitudeLaw(Protocol):
-    """What the inner loop may be: `AttitudePid` or `Pidnn`."""
-
-    def update(
-        self,
-        angles_rad: Floats,
-        omega_flu_rad_s: Floats,
-        desired_rad: Floats,
-        desired_rates_rad_s: Floats | None = None,
-        learn: bool = True,
-    ) -> Floats:
-        """Angular acceleration (3, n) in rad/s^2, FLU."""
-
-    def reset(self, vehicle: int | None = None) -> None:
-        """Start again, one vehicle or all."""
 
 
 @compiled

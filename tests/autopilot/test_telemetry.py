@@ -611,20 +611,3 @@ def test_what_there_is_not_is_not_streamed() -> None:
         "POSITION_TARGET_GLOBAL_INT",
     }
     assert {"ATTITUDE", "GLOBAL_POSITION_INT"} <= names
-
-
-# --- texts
-
-
-@pytest.mark.parametrize("length", [0, 1, 49, 50, 51, 99, 100, 101, 200])
-def test_texts_in_chunks(length: int) -> None:
-    text = "".join(chr(65 + i % 26) for i in range(length))
-    node = Node(1, 1)
-    telemetry.send_text(node, mavlink.MAV_SEVERITY_INFO, text, 9)
-    chunks = [parse(datagram)[0].message for datagram in node.datagrams()]
-    assert "".join(m.text for m in chunks) == text
-    assert [m.chunk_seq for m in chunks] == list(range(len(chunks)))
-    if length > 50:
-        assert len(chunks[-1].text) < 50  # the end is the chunk that is not full
-    else:
-        assert len(chunks) == 1

@@ -150,6 +150,8 @@ MISTAKES: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "lock-step over TCP": (
         ["ground", "--lockstep", "--link", "tcp:127.0.0.1:5760"], ("--link tcp:127.0.0.1:5760", "udpin:HOST:PORT")
     ),
+    "vehicle's duration": (["vehicle", "--duration", "3"], ("--duration", "no effect on the vehicle")),
+    "ground's seed": (["ground", "--seed", "3"], ("--seed", "no effect on the ground")),
     "wing": (["ground", "--wing", "kite", "--link", "udpin:127.0.0.1:0"], ("'kite'", "installed: paper")),
 }  # fmt: skip
 

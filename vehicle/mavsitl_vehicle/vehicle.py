@@ -60,7 +60,6 @@ class Vehicle:
         """
         self.period_us = flight.scenario.rates.control_period_us
         self._flight = flight
-        self._seed = seed
         self._system_id = system_id
         self._port_names = tuple(ports)
         self._lockstep = lockstep

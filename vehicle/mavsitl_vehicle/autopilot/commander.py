@@ -19,7 +19,6 @@ ACCEPTED: int = mavlink.MAV_RESULT_ACCEPTED
 TEMPORARILY_REJECTED: int = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 DENIED: int = mavlink.MAV_RESULT_DENIED
 UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
-FAILED: int = mavlink.MAV_RESULT_FAILED
 
 FORCE_MAGIC = (21196, 2989)
 """param2 of MAV_CMD_COMPONENT_ARM_DISARM that forces: PX4's number, and the one MAVProxy and QGroundControl send."""
@@ -121,7 +120,6 @@ class Commander:
         self.armed = False
         self.armed_at_us = 0
         self.home_set = False
-        self.disarm_count = 0
         self.situation = Situation(landed=True, setpoint_age_us=None)
         self.sticks_at_arming = False
         self.battery_at_arming = 0
@@ -343,7 +341,6 @@ class Commander:
 
     def _disarm(self, by: str) -> None:
         self.armed = False
-        self.disarm_count += 1
         landing = self.mode in (Mode.LAND, Mode.RTL, Mode.ORBIT, Mode.TERMINATION)
         self._tripped.clear()
         self._overridden.clear()

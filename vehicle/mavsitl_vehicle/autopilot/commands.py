@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from mavsitl.dialect import mavlink
 from mavsitl.services.command import Command
+from mavsitl.wire_units import from_deg_e7
 from mavsitl_vehicle.autopilot import modes, telemetry
 from mavsitl_vehicle.autopilot.commander import (
     ACCEPTED,
@@ -87,8 +88,8 @@ def place(autopilot: Autopilot, command: Command) -> Place | str:
     if frame is not None:
         if frame not in AMSL_FRAMES and frame not in RELATIVE_FRAMES:
             return f"frame {frame}"
-        latitude = nan if latitude == UNKNOWN_INT else latitude / 1e7
-        longitude = nan if longitude == UNKNOWN_INT else longitude / 1e7
+        latitude = nan if latitude == UNKNOWN_INT else from_deg_e7(latitude)
+        longitude = nan if longitude == UNKNOWN_INT else from_deg_e7(longitude)
         if frame in RELATIVE_FRAMES:
             altitude += autopilot.home_altitude_amsl_m
     if isfinite(latitude) and not abs(latitude) <= 90.0:
@@ -407,7 +408,8 @@ TABLE: dict[int, Row] = {
     _M.MAV_CMD_DO_SET_STANDARD_MODE: Row(_set_standard_mode, "as AVAILABLE_MODES lists them"),
     _M.MAV_CMD_DO_FLIGHTTERMINATION: Row(_terminate, "armed only; the rotors stop"),
     _M.MAV_CMD_NAV_TAKEOFF: Row(
-        _takeoff, "altitude above the sea, or of the ground where that is below; NaN: MIS_TAKEOFF_ALT; 0/0 is here"
+        _takeoff,
+        "altitude above the sea; COMMAND_LONG: over the ground where that is below; NaN: MIS_TAKEOFF_ALT; 0/0: here",
     ),
     _M.MAV_CMD_NAV_LAND: Row(_land, "always taken; lands where it is"),
     _M.MAV_CMD_NAV_RETURN_TO_LAUNCH: Row(_return, "AUTO.RTL"),
@@ -436,5 +438,5 @@ TABLE: dict[int, Row] = {
     _M.MAV_CMD_PREFLIGHT_CALIBRATION: Row(_calibrate, "refused: simulated sensors need none"),
     _M.MAV_CMD_PREFLIGHT_STORAGE: Row(_storage, "2 and 4 reset the parameters; disarmed only"),
     _M.MAV_CMD_RUN_PREARM_CHECKS: Row(_prearm_checks, "says what keeps it from arming"),
-    _M.MAV_CMD_INJECT_FAILURE: Row(_inject_failure, "needs SYS_FAILURE_EN"),
+    _M.MAV_CMD_INJECT_FAILURE: Row(_inject_failure, "refused: no failure is injected by command"),
 }

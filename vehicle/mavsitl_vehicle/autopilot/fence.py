@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 
 from mavsitl.dialect import mavlink
 from mavsitl.services.mission import MissionItem
+from mavsitl.wire_units import from_deg_e7
 
 __all__ = [
     "Breach",
@@ -195,7 +196,7 @@ class Fence:
                 name, corners, radius = f"{kind} circle {number}", (zone.center_e7,), zone.radius_m
             else:
                 name, corners, radius = f"{kind} polygon {number}", zone.vertices_e7, None
-            points = tuple(projection.to_local(x / 1e7, y / 1e7) for x, y in corners)
+            points = tuple(projection.to_local(from_deg_e7(x), from_deg_e7(y)) for x, y in corners)
             self._zones.append(_LocalZone(name, zone.inclusion, zone.group, points, radius))
 
     def __bool__(self) -> bool:

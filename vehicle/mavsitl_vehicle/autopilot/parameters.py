@@ -175,7 +175,7 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
                 "Put the parameters back to their defaults at the next start", live="boot", used_by="client"),
         _int("SYS_PARAM_VER", 1, 0, INT32_MAX, "", "Version of the airframe's parameter set", used_by="client"),
         _switch("SYS_FAILURE_EN", 0, "Let MAV_CMD_INJECT_FAILURE break things",
-                "Off: the command is refused.", note="PX4's SITL start-up script sets 1"),
+                "No failure can be injected by command yet.", note="PX4's SITL start-up script sets 1"),
         _int("SYS_HAS_MAG", 1, 0, 4, "", "Number of magnetometers", live="boot", used_by="client"),
         _switch("SYS_HAS_GPS", 1, "There is a GPS receiver", live="boot", used_by="client"),
         _switch("SYS_HAS_BARO", 1, "There is a barometer", live="boot", used_by="client"),

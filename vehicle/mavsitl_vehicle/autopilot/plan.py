@@ -28,6 +28,7 @@ from mavsitl.services.mission import (
     check_item,
     same_plan,
 )
+from mavsitl.wire_units import from_deg_e7
 from mavsitl_vehicle.autopilot.fence import (
     NO_LIMITS,
     Fence,
@@ -419,7 +420,7 @@ def action(item: MissionItem, home_altitude_amsl_m: float, takeoff_height_m: flo
     """
     command = item.command
     altitude_amsl_m = _altitude_amsl_m(item, home_altitude_amsl_m)
-    latitude_deg, longitude_deg = item.x / 1e7, item.y / 1e7
+    latitude_deg, longitude_deg = from_deg_e7(item.x), from_deg_e7(item.y)
     here = _is_here(item)
     where: tuple[float | None, float | None] = (None, None) if here else (latitude_deg, longitude_deg)
     yaw_deg = _open(item.param4)
@@ -480,7 +481,10 @@ class RallyPoint(NamedTuple):
 
 def rally_points(items: Sequence[MissionItem], home_altitude_amsl_m: float) -> tuple[RallyPoint, ...]:
     """Where a return may end besides home."""
-    return tuple(RallyPoint(item.x / 1e7, item.y / 1e7, _altitude_amsl_m(item, home_altitude_amsl_m)) for item in items)
+    return tuple(
+        RallyPoint(from_deg_e7(item.x), from_deg_e7(item.y), _altitude_amsl_m(item, home_altitude_amsl_m))
+        for item in items
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------- progress
@@ -714,7 +718,7 @@ def _check_positions(items: Sequence[MissionItem], context: FeasibilityContext, 
             # Where that will be is not known before; how high is.
             breach = no_zones.breach(home_north_m, home_west_m, height_m, home_north_m, home_west_m, context.limits)
         else:
-            north_m, west_m = context.projection.to_local(item.x / 1e7, item.y / 1e7)
+            north_m, west_m = context.projection.to_local(from_deg_e7(item.x), from_deg_e7(item.y))
             from_home_m = hypot(north_m - home_north_m, west_m - home_west_m)
             limit_m = context.first_waypoint_m
             if first and 0.0 < limit_m <= from_home_m:
@@ -904,10 +908,6 @@ class VehiclePlan:
         """Mission mode was left: an active mission is paused where it is."""
         if self.progress.state == ACTIVE:
             self._move(replace(self.progress, state=PAUSED))
-
-    def rewind(self) -> None:
-        """Begin at the first item next time, jumps uncounted: a completed mission, after disarming."""
-        self._move(begin(self._mission))
 
     def jump_to(self, seq: int, reset_jumps: bool = False) -> bool:
         """MISSION_SET_CURRENT and MAV_CMD_DO_SET_MISSION_CURRENT; False where there is no such item."""

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Quaternion, Vector, flip_quaternion, flip_vector
 from mavsitl.quaternion import rotate
+from mavsitl.wire_units import from_deg_e7
 
 ROLL_RATE_IGNORE = mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
 PITCH_RATE_IGNORE = mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
@@ -239,7 +240,7 @@ def from_position_target_global_int(
         return Refusal(f"{name} refused: latitude and longitude are used or ignored together")
     north = west = up = nan
     if not ignored:
-        latitude, longitude = message.lat_int / 1e7, message.lon_int / 1e7
+        latitude, longitude = from_deg_e7(message.lat_int), from_deg_e7(message.lon_int)
         if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
             return Refusal(f"{name} refused: no place on earth at {latitude:g}, {longitude:g}")
         north, west = origin.to_local(latitude, longitude)

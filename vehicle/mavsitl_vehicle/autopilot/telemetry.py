@@ -247,8 +247,6 @@ CAPABILITIES = (
 )
 """What is served, and nothing more: clients act on these bits."""
 
-TEXT_BYTES = 50
-"""STATUSTEXT.text; longer texts go in chunks."""
 MAX_INTERVAL_US = 2**31 - 1
 """The longest that MESSAGE_INTERVAL can report."""
 
@@ -435,19 +433,6 @@ def send_system_time(subject: Subject, node: Node, now_us: int) -> bool:
     base = subject.unix_boot_us
     node.send(_SYSTEM_TIME, base + now_us if base else 0, boot_ms(now_us))
     return True
-
-
-_STATUSTEXT = _pack("statustext")
-
-
-def send_text(node: Node, severity: int, text: str, text_id: int) -> None:
-    """STATUSTEXT; a long one in chunks under `text_id` (1 to 65535), of which the last is the one that is not full."""
-    data = text.encode("ascii", "replace")
-    if len(data) <= TEXT_BYTES:
-        node.send(_STATUSTEXT, severity, data, 0, 0)
-        return
-    for chunk, begin in enumerate(range(0, len(data) + 1, TEXT_BYTES)):
-        node.send(_STATUSTEXT, severity, data[begin : begin + TEXT_BYTES], text_id, chunk)
 
 
 # --- attitude and position -------------------------------------------------------------------------------------------

@@ -20,7 +20,6 @@ OMEGA = 10
 """Rows 10:13, rad/s, body rates FLU."""
 ROTOR = 13
 """Rows 13:17, rad/s, speeds of rotors 1 (rear), 2 (right), 3 (front), 4 (left), never negative."""
-N_BODY = 13
 """Rows of the rigid body: all but the rotors."""
 N_STATES = 17
 
