@@ -568,8 +568,9 @@ class _Status:
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
         self.stopped = False
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, self._stop)
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # the last where the system has it: the terminal was closed
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), self._stop)
 
     def _stop(self, number: int, frame: Any) -> None:
         if self.stopped:

@@ -487,6 +487,11 @@ class LinkSigning:
         self.trusted = trusted
         self.counters = SigningCounters()
 
+    @property
+    def active(self) -> bool:
+        """This link signs and demands signatures: only a signed frame tells who is there."""
+        return self._signing.active(self.trusted)
+
     def outgoing(self, frames: list[bytes], own: tuple[int, int]) -> list[bytes]:
         """The frames to send, those of `own` address signed if this link signs; forwarded ones stay as they are."""
         signing = self._signing

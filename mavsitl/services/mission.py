@@ -521,7 +521,7 @@ class MissionServer:
         if transaction is None or self._running(sender) is not None:
             return False
         # Its own server ends it too, but on a link that is stepped no more nobody would.
-        if transaction.all_served or now_us - transaction.progress_us >= GIVE_UP_US:
+        if transaction.all_served or not 0 <= now_us - transaction.progress_us < GIVE_UP_US:
             transaction.server._end(transaction)
             return False
         return True
@@ -718,7 +718,8 @@ class MissionServer:
             return self._busy(sender, mission_type)
         self._drop_own(sender)
         for cleared in sorted(self._stores.limits) if mission_type == ALL else (mission_type,):
-            self._stores.replace(cleared, ())
+            if self._stores.items(cleared):
+                self._stores.replace(cleared, ())
         return (_ack(sender, ACCEPTED, mission_type),)
 
     def _on_set_current(self, message: Any, sender: Peer, now_us: int) -> Sequence[Message]:

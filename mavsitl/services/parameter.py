@@ -80,8 +80,8 @@ class ParameterTable(Protocol):
     def hash(self) -> int:
         """The value of `_HASH_CHECK`."""
 
-    def subscribe(self, listener: Callable[[str, float], None], /) -> None:
-        """`listener(name, value)` is called after each change."""
+    def subscribe(self, listener: Callable[[str, float], None], /) -> Callable[[], None]:
+        """`listener(name, value)` is called after each change, until the function that is returned is called."""
 
 
 def encode_value(value: float, param_type: int) -> bytes | None:
@@ -191,7 +191,8 @@ class ParameterServer:
             mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ: self._on_read,
             mavlink.MAVLINK_MSG_ID_PARAM_SET: self._on_set,
         }
-        table.subscribe(self._on_change)
+        self.close = table.subscribe(self._on_change)
+        """Hear of no more changes: the link is gone."""
 
     def receive(self, message: Message, sender: Peer, now_us: int) -> Sequence[Message]:
         """PARAM_REQUEST_LIST, PARAM_REQUEST_READ or PARAM_SET, as the codec decoded it; others are ignored."""

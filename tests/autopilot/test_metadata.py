@@ -57,9 +57,9 @@ def test_rows_of_each_kind() -> None:
         {"index": 1, "description": "Hold"},
         {"index": 2, "description": "OFFBOARD"},
     ]
-    assert rows["MAV_SYS_ID"]["rebootRequired"] is True
+    assert rows["SYS_HAS_MAG"]["rebootRequired"] is True
     assert rows["COM_FLIGHT_UUID"]["volatile"] is rows["COM_FLIGHT_UUID"]["readOnly"] is True
-    assert "volatile" not in rows["MAV_SYS_ID"]
+    assert "volatile" not in rows["SYS_HAS_MAG"]
 
 
 def test_the_general_file_leads_to_the_others() -> None:

@@ -56,8 +56,8 @@ class FreeTable:
     def hash(self) -> int:
         return self.crc
 
-    def subscribe(self, listener: Callable[[str, float], None], /) -> None:
-        pass
+    def subscribe(self, listener: Callable[[str, float], None], /) -> Callable[[], None]:
+        return lambda: None
 
 
 def wire(message: Any) -> Any:

@@ -77,7 +77,7 @@ class Vehicle:
         self._stores = () if state is None else (parameter_store, plan_store)
         self.plan = VehiclePlan(
             report=lambda severity, text: self.autopilot.queue_text(severity, text),
-            changed=lambda mission_type: plan_store.put(json.loads(self.plan.to_json())),
+            changed=lambda mission_type: plan_store.put(lambda: json.loads(self.plan.to_json())),
         )
         self._load_plan(plan_store)
         self._signing_store = Store(state, "signing", SIGNING_SCHEMA, self._notes.append, private=True)
@@ -102,7 +102,7 @@ class Vehicle:
             try:
                 self.plan.load_json(json.dumps(content))
             except PlanError as error:
-                self._notes.append(f"{store.path}: left out: {error}")
+                store.set_aside(str(error))
 
     def _load_signing(self) -> Signing | None:
         if self._unix_us is None:
@@ -113,7 +113,7 @@ class Vehicle:
             try:
                 state = SigningState.from_bytes(bytes.fromhex(content["state"]))
             except (KeyError, TypeError, ValueError):
-                self._notes.append(f"{self._signing_store.path}: damaged, signing begins without a key")
+                self._signing_store.set_aside("signing begins without a key")
         signing = Signing(lambda: unix_us() - EPOCH_UNIX_US, state=state)
         signing.policy.mode = SigningMode(int(self.parameters["MAV_SIGN_CFG"]))
         return signing
@@ -247,6 +247,7 @@ class Vehicle:
         if not old.health.upright and old.on_ground:
             self.simulation.set_upright()
         self._boot_us = now_us
+        self.plan.stores.transaction = None  # it counts in the old time
         self.autopilot = self._boot(now_us)
         self.autopilot.land.held = old.land.held
         for port, before in zip(self.autopilot.ports, old.ports, strict=True):

@@ -42,6 +42,8 @@ LIFT_MARGIN_M = 0.1
 """An off-board position so far above the vehicle asks to leave the ground."""
 UPRIGHT_TILT_RAD = radians(60.0)
 """PX4's FD_FAIL_R and FD_FAIL_P: beyond this the vehicle has fallen over."""
+MAX_TEXTS = 50
+"""STATUSTEXTs that wait for the end of a period; what is beyond them is lost."""
 LOOK_US = 12_000
 """So often the commander decides (PX4's: every 10 ms). A command, or a stream that returns, makes it look at once."""
 HOUSEKEEPING_US = 100_000
@@ -121,6 +123,7 @@ class Autopilot:
         )
         self.pilot = Pilot(parameters, self._gravity, self._hover_thrust, period_s)
         self.land = LandDetector(self._hover_thrust, period_s, clamped=start.clamp)
+        self._armed_at_us = 0
         self._flown: Mode | None = None
         """The mode flown in the last period; None: disarmed."""
         self._control = Control.NOBODY
@@ -156,18 +159,20 @@ class Autopilot:
     # --- messages in -------------------------------------------------------------------------------------------------
 
     def receive(self, port_index: int, datagram: bytes, now_us: int, at_us: int | None = None) -> int:
-        """Take one datagram from a link; the number of valid MAVLink frames in it. Never raises on what is in it.
+        """Take one datagram from a link; the number of frames in it that tell who sent it. Never raises on its content.
 
-        `now_us` is the last tick's time, `at_us` when the datagram came; None: then.
+        Where signatures are demanded, a frame that is let in without one tells nothing. `now_us` is the last tick's
+        time, `at_us` when the datagram came; None: then.
         """
         port = self.ports[port_index]
         node = port.node
         frames = node.receive(datagram)
         self._now_us = now_us
         several = len(self.ports) > 1
+        signed_only = node.signing is not None and node.signing.active
         for frame in frames:
             message = frame.message
-            if several:
+            if several and (frame.signed or not signed_only):
                 self._router.note(port_index, (frame.system_id, frame.component_id), now_us)
             if node.addressed_to(frame):
                 handler = self._handlers.get(type(message).id)
@@ -178,7 +183,7 @@ class Autopilot:
             if several:
                 for other in self._router.destinations(port_index, frame, now_us):
                     self.ports[other].forward(message.get_msgbuf(), now_us)
-        return len(frames)
+        return sum(frame.signed for frame in frames) if signed_only else len(frames)
 
     def _on_attitude_target(self, message: Message, frame: Frame, now_us: int) -> None:
         self.token_us = message.time_boot_ms * 1000
@@ -299,6 +304,8 @@ class Autopilot:
 
     def queue_text(self, severity: int, text: str) -> None:
         """A STATUSTEXT for every link."""
+        if len(self._texts) >= MAX_TEXTS:
+            return
         self._text_id = self._text_id % 65535 + 1
         self._texts += chunks(severity, text, self._text_id)
 
@@ -374,7 +381,8 @@ class Autopilot:
 
     def look(self, now_us: int) -> None:
         """Before a request: a plan that was uploaded just now counts."""
-        self._refresh_plan()
+        if self._plan_watch.stale:
+            self._refresh_plan()
         self._step_commander(now_us)
 
     def _step_commander(self, now_us: int) -> None:
@@ -404,9 +412,9 @@ class Autopilot:
         if now_us >= self._look_us:
             self._step_commander(now_us)
         commander = self.commander
+        if self._flown is not None and not (commander.armed and commander.armed_at_us == self._armed_at_us):
+            self._stand_down(now_us)  # also where it was disarmed and armed again since the last period
         if not commander.armed:
-            if self._flown is not None:
-                self._stand_down(now_us)
             return None
         mode = commander.mode
         halted = commander.failsafe and mode is Mode.LOITER
@@ -497,7 +505,7 @@ class Autopilot:
         self._control = control
         if control is Control.NAVIGATOR:
             acceleration = self._position_control.acceleration_setpoint_nwu_m_s2 if self._cascade else (0.0, 0.0, 0.0)
-            self.navigator.enter(mode, state, acceleration, self.on_ground, now_us)
+            self.navigator.enter(mode, state, acceleration, self.on_ground, now_us, by_failsafe=self.commander.failsafe)
         else:
             self.navigator.leave()
             if control is Control.STICKS:
@@ -505,6 +513,7 @@ class Autopilot:
         self._cascade = False  # its next setpoint begins at the one that is flown
 
     def _arm(self, now_us: int) -> None:
+        self._armed_at_us = self.commander.armed_at_us
         self.set_home_here()
         self.flight_times = FlightTimes(max(now_us, 1), 0, 0, self.flight_times.number + 1)
 

@@ -257,7 +257,7 @@ class Commander:
         worst = Action.NONE
         for row in FAILSAFES:
             if not row.tripped(self):
-                self._clear(row)
+                worst = max(worst, self._clear(row))
                 continue
             if row.name in self._overridden:
                 continue
@@ -290,17 +290,19 @@ class Commander:
         else:
             self._report(mavlink.MAV_SEVERITY_CRITICAL, f"Failsafe activated: {row.name}, {action.name.lower()}")
 
-    def _clear(self, row: Failsafe) -> None:
+    def _clear(self, row: Failsafe) -> Action:
+        """The cause has gone: what still holds all the same, until the user chooses or the vehicle disarms."""
         self._overridden.discard(row.name)
         known = self._tripped.get(row.name)
         if known is None:
-            return
+            return _A.NONE
         held_only = row.deferred and known[1] is _A.HOLD
         if known[1] in ACTION_MODES and self.failsafe and not row.ends_with_cause and not held_only:
-            return
+            return known[1]
         del self._tripped[row.name]
         if row.regained:
             self._report(mavlink.MAV_SEVERITY_INFO, row.regained)
+        return _A.NONE
 
     def _latched(self) -> bool:
         """A row whose cause has gone still holds its mode, until the user chooses or the vehicle disarms."""

@@ -71,7 +71,7 @@ def execute(autopilot: Autopilot, command: Command, now_us: int, port: Port) -> 
     """Do it; the MAV_RESULT of its COMMAND_ACK. What it requests by message goes out on `port`."""
     row = TABLE.get(command.id)
     if row is None:
-        autopilot.warn(f"unsupported {command.id}", f"Command {command.id} is not supported")
+        autopilot.warn("unsupported", f"Command {command.id} is not supported")
         return UNSUPPORTED
     return row.handler(autopilot, command, now_us, port)
 
@@ -361,6 +361,8 @@ def _reboot(autopilot: Autopilot, command: Command, now_us: int, port: Port) -> 
         return _deny(autopilot, f"Reboot refused: param1 is {command.params[0]:g}, need 0 or 1", UNSUPPORTED)
     if autopilot.commander.armed:
         return _deny(autopilot, "Reboot refused: armed")
+    if not autopilot.on_ground:
+        return _deny(autopilot, "Reboot refused: in the air")
     if autopilot.lockstep:
         return _deny(autopilot, "Reboot refused: in lock-step the clock goes on")
     autopilot.reboot_requested = True

@@ -30,6 +30,8 @@ from mavsitl_vehicle.autopilot.setpoints import State
 NOT_STARTED: int = mavlink.MISSION_STATE_NOT_STARTED
 ACTIVE: int = mavlink.MISSION_STATE_ACTIVE
 COMPLETE: int = mavlink.MISSION_STATE_COMPLETE
+ADVANCE_US = 100_000
+"""Between two items at least: a loop of items that take no time floods nobody with MISSION_ITEM_REACHED."""
 YAW_TIMEOUT_US = 5_000_000
 """A heading that is not reached does not hold the mission up for longer."""
 
@@ -76,9 +78,12 @@ class MissionCourse:
         self._yaw_rad = nan
         self._lowering = False
         self._roi: Vector | None = None
+        self._advanced_us = -ADVANCE_US
 
     def begin(self, navigator: Navigator, now_us: int) -> None:
         self._plan.in_mission_mode = True
+        if self._plan.progress.state in (NOT_STARTED, COMPLETE):
+            self._roi = None
         self._plan.start()
         self._revision = -1
 
@@ -99,12 +104,14 @@ class MissionCourse:
             if navigator.takeoff_done(state):
                 self._lifting = None
                 self._start(action, navigator, state, now_us)
-        elif self._done(action, navigator, state, now_us):
+        elif self._done(action, navigator, state, now_us) and now_us - self._advanced_us >= ADVANCE_US:
+            self._advanced_us = now_us
             self._plan.advance()
 
     def _take_up(self, navigator: Navigator, state: State, now_us: int) -> None:
         """The plan says something else than before: carry out what is done at once, begin what is flown."""
         if self._plan.progress.state == NOT_STARTED and self._world.mission_refusal is None:
+            self._roi = None
             self._plan.start()  # another mission was uploaded in flight
         turn = self._plan.turn(self._world.home_altitude_amsl_m, self._parameters["MIS_TAKEOFF_ALT"])
         self._revision = self._plan.revision
@@ -115,6 +122,9 @@ class MissionCourse:
         self._lowering = False
         self._action = turn.fly
         if turn.fly is None:
+            progress = self._plan.progress
+            if progress.state == ACTIVE and not progress.waiting:
+                self._revision = -1  # more instantaneous items than one call does: on in the next period
             # Complete, or waiting at an item that does not continue: it goes all the way to that item.
             if self._plan.progress.state not in (ACTIVE, COMPLETE):
                 navigator.hold()

@@ -93,6 +93,8 @@ class Navigator:
         self._takeoff_height: float | None = None
         self._takeoff_position: tuple[float, float] | None = None
         self._takeoff_yaw_rad: float | None = None
+        self._interrupted: tuple[float, tuple[float, float] | None] | None = None
+        """Height and place of a take-off that a fail-safe broke off."""
         self._takeoff_asked = False
         """By parameters of its own, which no take-off has followed yet."""
         self._target_height = 0.0
@@ -148,13 +150,29 @@ class Navigator:
 
     # --- a period ----------------------------------------------------------------------------------------------------
 
-    def enter(self, mode: Mode, state: State, acceleration_nwu_m_s2: Vector, on_ground: bool, now_us: int) -> None:
-        """`mode` flies from now on, from the vehicle's own motion: no jump."""
+    def enter(
+        self,
+        mode: Mode,
+        state: State,
+        acceleration_nwu_m_s2: Vector,
+        on_ground: bool,
+        now_us: int,
+        *,
+        by_failsafe: bool = False,
+    ) -> None:
+        """`mode` flies from now on, from the vehicle's own motion: no jump.
+
+        A take-off that a fail-safe interrupts (`by_failsafe`) goes on to its own height when the fail-safe has ended.
+        """
+        if self._mode is Mode.TAKEOFF and self._task is Task.TAKEOFF and by_failsafe:
+            self._interrupted = (self._target_height, self._takeoff_position)
         if self._mode is Mode.MISSION and mode is not Mode.MISSION:
             self._course.pause()
         arrived = self.finished is Mode.TAKEOFF and mode is Mode.LOITER and self._pending_go is None
         self._mode = mode
         self.finished = None
+        if mode is not Mode.TAKEOFF and not by_failsafe:
+            self._interrupted = None
         if mode is not Mode.TAKEOFF:
             self._takeoff_height = self._takeoff_yaw_rad = None
             self._takeoff_asked = False
@@ -191,6 +209,7 @@ class Navigator:
         self._mode = None
         self.landing = False
         self.finished = None
+        self._interrupted = None
         self._pending_go = self._pending_orbit = None
         self._forget_speeds()
 
@@ -311,6 +330,9 @@ class Navigator:
 
     def _begin_takeoff(self, state: State) -> None:
         base = self._ground_under()
+        if self._interrupted is not None and not self._takeoff_asked:
+            self._takeoff_height, self._takeoff_position = self._interrupted
+        self._interrupted = None
         height = self._takeoff_height
         if height is None:
             height = base + self._parameters["MIS_TAKEOFF_ALT"]

@@ -184,7 +184,8 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
     ),
     _group(
         "MAVLink",
-        _int("MAV_SYS_ID", 1, 1, 255, "", "MAVLink system id", live="boot", note="PX4: 1 to 250"),
+        _int("MAV_SYS_ID", 1, 1, 255, "", "MAVLink system id", read_only=True,
+             note="set by --system; PX4: 1 to 250, by a reboot"),
         _int("MAV_COMP_ID", 1, 1, 1, "", "MAVLink component id", live="boot", used_by="client", note="PX4: 1 to 250"),
         _choice("MAV_TYPE", 2, {2: "Quadrotor"}, "Vehicle type in HEARTBEAT", live="boot", used_by="client",
                 note="PX4: 0, set by its start-up script"),
@@ -574,9 +575,12 @@ class Parameters:
         for name in self.changed():
             self._store(TABLE[name], self._defaults[name])
 
-    def subscribe(self, listener: Listener) -> None:
-        """`listener(name, value)` is called after each change; not for a value that was there already."""
+    def subscribe(self, listener: Listener) -> Callable[[], None]:
+        """`listener(name, value)` is called after each change, not for a value that was there already, until the
+        function that is returned is called.
+        """
         self._listeners.append(listener)
+        return lambda: self._listeners.remove(listener)
 
     def hash(self) -> int:
         """PX4's `_HASH_CHECK`: names and four-byte values in sorted order, volatile ones left out.

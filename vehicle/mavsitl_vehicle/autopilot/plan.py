@@ -263,7 +263,9 @@ def check_any_item(mission_type: int, seq: int, item: MissionItem) -> int:
     """MAV_MISSION_RESULT of one item of any of the three plans."""
     if mission_type == MISSION:
         return check_mission_item(item)
-    return check_fence_item(item) if mission_type == FENCE else ACCEPTED
+    if mission_type == RALLY:
+        return ACCEPTED if abs(item.z) <= MAX_ALTITUDE_M else INVALID_PARAM7
+    return check_fence_item(item)
 
 
 def validate_plan(mission_type: int, items: Sequence[MissionItem]) -> tuple[int, int]:

@@ -48,6 +48,12 @@ class PlanWatch:
         """GF_ACTION is not "none"."""
         return self._parameters["GF_ACTION"] > 0
 
+    @property
+    def stale(self) -> bool:
+        """Another mission or fence has come since the last look."""
+        stores = self._plan.stores
+        return self._mission_seen[:2] != (stores.id(MISSION), stores.id(FENCE))
+
     def breach(self, position_nwu_m: Vector) -> str | None:
         """Why the fence does not allow a position, whatever GF_ACTION is; None where it does, or home is not known."""
         if self._home is None:

@@ -100,7 +100,7 @@ class Port:
         self._busy_until_us = 0
         self._step_us = 0
         self._forwarded = TokenBucket(FORWARDED_HZ, FORWARDED_BURST)
-        parameters = ParameterServer(shared.parameters, autopilot.warn_parameter)
+        parameters = self._parameters = ParameterServer(shared.parameters, autopilot.warn_parameter)
         missions = MissionServer(shared.plan.stores, current_interval_us=None if lockstep else 1_000_000)
         self._files = FtpServer(shared.files)
         self._logs = LogServer(shared.logs)
@@ -161,6 +161,7 @@ class Port:
 
     def close(self) -> None:
         """Close the files that clients had open."""
+        self._parameters.close()
         self._files.close()
         self._logs.close()
 

@@ -15,6 +15,8 @@ from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, PositionSetpoi
 
 DERIVATIVE_FILTER_S = 1.0 / (2.0 * pi * 5.0)
 """Time constant of the velocity's derivative: PX4's default of MPC_VELD_LP, 5 Hz."""
+LEAST_UP = 1e-3
+"""Upward share of the thrust vector, so that it has a direction whatever the limits are."""
 BLEND_S = 0.2
 """Time constant in which the step that a switch of modes would make fades."""
 YAW_LEAD_RAD = 0.3
@@ -133,6 +135,7 @@ class PositionControl:
             tx, ty, up = tx + share * (fx - tx), ty + share * (fy - ty), up + share * (fz - up)
             yaw_rad += share * remainder(self._flown_yaw_rad - yaw_rad, 2.0 * pi)
             self._share = self._fade * share if share > 1e-3 else 0.0
+        up = max(up, LEAST_UP)
         thrust = sqrt(tx * tx + ty * ty + up * up)
         attitude = thrust_attitude((tx / thrust, ty / thrust, up / thrust), yaw_rad)
         return AttitudeSetpoint(attitude, yaw_rate_rad_s, min(thrust, thrust_max))
@@ -242,6 +245,8 @@ def _add_within(ax: float, ay: float, bx: float, by: float, limit: float) -> tup
     if x * x + y * y <= limit * limit:
         return x, y
     length = hypot(ax, ay)
+    if limit <= 0.0:
+        return 0.0, 0.0
     if length >= limit:
         return ax * limit / length, ay * limit / length
     # |a + k b| = limit, 0 < k < 1: a is inside the circle and a + b outside

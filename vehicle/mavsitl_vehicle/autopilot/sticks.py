@@ -219,7 +219,7 @@ def _aloft(forward: float, left: float, yaw_rad: float) -> tuple[float, float]:
 
 def _shaped(stick: float, dead_zone: float) -> float:
     """0 in the dead zone, +-1 at the ends, between them a line and a cube."""
-    size = abs(stick)
+    size = min(abs(stick), 1.0)
     if size <= dead_zone:
         return 0.0
     size = (size - dead_zone) / (1.0 - dead_zone)

@@ -36,7 +36,7 @@ class Store:
         self._schema = schema
         self._report = report
         self._mode = 0o600 if private else 0o644
-        self._pending: Mapping[str, Any] | None = None
+        self._pending: Mapping[str, Any] | Callable[[], Mapping[str, Any]] | None = None
         self._due_us: int | None = None
         """When to write; None: at the first step that sees the change."""
         self._failing = False
@@ -56,7 +56,7 @@ class Store:
         try:
             return self._parse(data)
         except (ValueError, RecursionError) as error:
-            self._set_aside(str(error) or "nested too deeply")
+            self.set_aside(str(error) or "nested too deeply")
             return {}
 
     def _parse(self, data: bytes) -> dict[str, Any]:
@@ -70,7 +70,7 @@ class Store:
         content: dict[str, Any] = document["content"]
         return content
 
-    def _set_aside(self, reason: str) -> None:
+    def set_aside(self, reason: str) -> None:
         assert self.path is not None
         aside = self.path.with_name(f"{self.path.name}.bad")
         try:
@@ -81,8 +81,8 @@ class Store:
             kept = f"kept as {aside.name}"
         self._report(f"{self.path}: damaged ({reason}), the defaults hold; {kept}")
 
-    def put(self, content: Mapping[str, Any]) -> None:
-        """What the file shall hold from now on; must be JSON and must not change afterwards."""
+    def put(self, content: Mapping[str, Any] | Callable[[], Mapping[str, Any]]) -> None:
+        """What the file shall hold from now on: JSON that does not change afterwards, or what makes it at the time."""
         if self.path is not None:
             self._pending = content
 
@@ -99,7 +99,8 @@ class Store:
         """Write now what is not written yet. False where that fails; it stays to be written."""
         if self._pending is None or self.path is None:
             return True
-        document = {"schema": self._schema, "content": self._pending}
+        content = self._pending() if callable(self._pending) else self._pending
+        document = {"schema": self._schema, "content": content}
         data = (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode("utf-8")
         try:
             _write(self.path, data, self._mode)
