@@ -3,6 +3,9 @@
 In lock-step all frames of one tick travel in one datagram each way, in memory and over UDP alike, so both put the same
 bytes on the wire. The vehicle advances when a setpoint echoes the stamp of its telemetry; a peer that stays silent is
 named.
+
+Over an impaired link the vehicle's end owns both directions of it, and a tick is one exchange, of whatever is due:
+nothing, too. The ground counts exchanges for its clock, so that it acts on what it has when its time comes.
 """
 
 from __future__ import annotations
@@ -16,12 +19,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from mavsitl.clock import LatenessHistogram, PacedClock, monotonic_us
 from mavsitl.link.base import Link, LinkError, LinkSilent
+from mavsitl.link.exchange import EXCHANGE_BYTES, HELLO, pack, unpack
 from mavsitl.link.sockets import wait_any
 from mavsitl.link.udp import ConnectedUdp
 from mavsitl.log.tlog import Direction, TlogWriter, WireHash
 
 if TYPE_CHECKING:
     from mavsitl.check import Check
+    from mavsitl.link.impaired import Channels
 
 FIRST_REPEAT_S = 0.1
 """Lock-step: the first datagram is repeated this often until the other side is there."""
@@ -176,13 +181,22 @@ def fly_in_memory(
     *,
     max_time_s: float = math.inf,
     progress: Progress | None = None,
+    channels: Channels | None = None,
 ) -> int:
     """Both ends in this process until both have finished; the microseconds simulated.
 
+    `channels`: what is between them; None: nothing, every message comes in the tick it was sent.
     Raises `LockstepError` when the ground stops answering or `max_time_s` is over.
     """
     tap = tap or Tap()
     throttle = _Throttle(progress)
+    if channels is not None:
+        turns = _GroundTurns(ground)
+
+        def exchange(now_us: int, messages: list[bytes]) -> tuple[list[bytes], bool]:
+            return turns.take(messages), ground.finished
+
+        return _fly_impaired(vehicle, channels, exchange, tap, max_time_s, throttle)
     now_us, period_us, last_us = 0, vehicle.period_us, max_time_s * 1e6
     ground_us = 0
     while True:
@@ -207,6 +221,103 @@ def fly_in_memory(
         now_us += period_us
 
 
+class _GroundTurns:
+    """The ground over an impaired link: its clock is the number of exchanges, its period each."""
+
+    def __init__(self, ground: GroundCore) -> None:
+        self._ground = ground
+        self.now_us = -ground.period_us
+
+    def take(self, messages: list[bytes]) -> list[bytes]:
+        """One exchange: what came, a step, and what it says."""
+        self.now_us += self._ground.period_us
+        for message in messages:
+            self._ground.receive(0, message)
+        self._ground.step(self.now_us)
+        return self._ground.datagrams(0, combine=True)
+
+
+def _fly_impaired(
+    vehicle: VehicleCore,
+    channels: Channels,
+    exchange: Callable[[int, list[bytes]], tuple[list[bytes], bool]],
+    tap: Tap,
+    max_time_s: float,
+    throttle: _Throttle,
+) -> int:
+    """The vehicle's end over an impaired link, in memory and over UDP alike, until both ends have finished.
+
+    `exchange` hands over what is due to the ground and returns its answer, and whether that was its last. The tap
+    hears what passes between the ends: behind the one channel, before the other.
+    """
+    now_us, period_us, last_us = 0, vehicle.period_us, max_time_s * 1e6
+    while True:
+        vehicle.step(now_us)
+        channels.fly(now_us, vehicle.flight_time_s)
+        for datagram in vehicle.datagrams(0, combine=True):
+            channels.to_ground.send(datagram, now_us)
+        messages = channels.to_ground.due(now_us, EXCHANGE_BYTES)
+        for message in messages:
+            tap.hear(Direction.FROM_VEHICLE, now_us, message)
+        answers, last = exchange(now_us, messages)
+        for answer in answers:
+            tap.hear(Direction.FROM_GROUND, now_us, answer)
+            channels.to_vehicle.send(answer, now_us)
+        for message in channels.to_vehicle.due(now_us):
+            vehicle.receive(0, message)
+        if last and vehicle.finished:
+            return now_us
+        if last:
+            raise LockstepError(f"the ground ended at t = {now_us / 1e6:g} s and the vehicle has not disarmed")
+        if now_us >= last_us:
+            raise LockstepError(f"the flight did not end within {max_time_s:g} s of simulated time")
+        tap.tick(now_us)
+        throttle(vehicle)
+        now_us += period_us
+
+
+class _Exchanges:
+    """The vehicle's side of the exchanges over UDP."""
+
+    def __init__(
+        self, link: ConnectedUdp, vehicle: VehicleCore, throttle: _Throttle, pin: _Pin,
+        deadline_s: float, start_deadline_s: float,
+    ) -> None:  # fmt: skip
+        self._link = link
+        self._vehicle = vehicle
+        self._throttle = throttle
+        self._pin = pin
+        self._deadline_s = deadline_s
+        self._start_deadline_s = start_deadline_s
+        self._met = False
+
+    def __call__(self, now_us: int, messages: list[bytes]) -> tuple[list[bytes], bool]:
+        if not self._met:
+            self._link.send(HELLO)
+            if self._receive(now_us, self._start_deadline_s, HELLO) != HELLO:
+                unpack(b"")  # says what is wrong
+            self._met = True
+            self._pin()
+        self._link.send(pack(messages))
+        answer = HELLO
+        while answer == HELLO:  # of one that was repeated
+            answer = self._receive(now_us, self._deadline_s)
+        return unpack(answer)
+
+    def _receive(self, now_us: int, limit_s: float, repeated: bytes | None = None) -> bytes:
+        patience = round(limit_s / FIRST_REPEAT_S)
+        while True:
+            try:
+                return self._link.receive()
+            except LinkSilent as silence:
+                self._throttle.now(self._vehicle)
+                patience -= 1
+                if patience <= 0:
+                    raise _stopped(now_us, limit_s, silence) from silence
+                if repeated is not None:
+                    self._link.send(repeated)
+
+
 def _stopped(now_us: int, limit_s: float, silence: LinkSilent) -> LinkSilent:
     return LinkSilent(f"lock-step stopped at t = {now_us / 1e6:g} s after {limit_s:g} s of silence: {silence}")
 
@@ -220,12 +331,19 @@ def run_lockstep_vehicle(
     start_deadline_s: float = 60.0,
     cpu: int | None = None,
     progress: Progress | None = None,
+    channels: Channels | None = None,
+    max_time_s: float = math.inf,
 ) -> int:
     """The vehicle's end, until it has finished; the microseconds simulated. `link` times out after `FIRST_REPEAT_S`.
 
+    `channels`: the impaired link between the ends, which the ground's end must know of (`impaired`); only then is
+    `max_time_s` the limit of simulated time, beyond which a `LockstepError` is raised.
     Raises `LinkSilent` naming the peer when it is silent for `deadline_s` (`start_deadline_s` before its first answer).
     """
     throttle = _Throttle(progress)
+    if channels is not None:
+        exchange = _Exchanges(link, vehicle, throttle, _Pin(cpu), deadline_s, start_deadline_s)
+        return _fly_impaired(vehicle, channels, exchange, tap, max_time_s, throttle)
     now_us, period_us = 0, vehicle.period_us
     repeat = round(1.0 / FIRST_REPEAT_S)
     pin = _Pin(cpu)
@@ -275,15 +393,19 @@ def run_lockstep_ground(
     start_deadline_s: float = 60.0,
     cpu: int | None = None,
     progress: Progress | None = None,
+    impaired: bool = False,
 ) -> int:
     """The ground's end: it answers each datagram of the vehicle, until it has finished; the vehicle's last stamp.
 
+    `impaired`: the vehicle's end has an impaired link; then the time of the last exchange is returned.
     Raises `LinkSilent` naming the peer when it is silent for `deadline_s` (`start_deadline_s` before its first
     datagram); `link` has a time-out of `FIRST_REPEAT_S`.
     """
     throttle = _Throttle(progress)
-    now_us = 0
     pin = _Pin(cpu)
+    if impaired:
+        return _ground_impaired(ground, link, tap, deadline_s, start_deadline_s, pin, throttle)
+    now_us = 0
     last = b""
     limit_s = start_deadline_s
     patience = round(limit_s / FIRST_REPEAT_S)
@@ -301,6 +423,8 @@ def run_lockstep_ground(
         if datagram == last:  # the vehicle repeats its first until it is answered
             continue
         last = datagram
+        if datagram == HELLO:
+            unpack(b"")  # the other side has an impaired link: says so
         pin()
         ground.receive(0, datagram)
         now_us = max(now_us, ground.vehicle_time_us)
@@ -312,6 +436,40 @@ def run_lockstep_ground(
         tap.tick(now_us)
         throttle(ground)
     return now_us
+
+
+def _ground_impaired(
+    ground: GroundCore, link: ConnectedUdp, tap: Tap, deadline_s: float, start_deadline_s: float,
+    pin: _Pin, throttle: _Throttle,
+) -> int:  # fmt: skip
+    turns = _GroundTurns(ground)
+    limit_s = start_deadline_s
+    patience = round(limit_s / FIRST_REPEAT_S)
+    while not ground.finished:
+        try:
+            datagram = link.receive()
+        except LinkSilent as silence:
+            throttle.now(ground)
+            patience -= 1
+            if patience <= 0:
+                raise _stopped(max(turns.now_us, 0), limit_s, silence) from silence
+            continue
+        limit_s = deadline_s
+        patience = round(limit_s / FIRST_REPEAT_S)
+        if datagram == HELLO:
+            link.send(HELLO)
+            continue
+        messages, _ = unpack(datagram)
+        pin()
+        answers = turns.take(messages)
+        for message in messages:
+            tap.hear(Direction.FROM_VEHICLE, turns.now_us, message)
+        for answer in answers:
+            tap.hear(Direction.FROM_GROUND, turns.now_us, answer)
+        link.send(pack(answers, last=ground.finished))
+        tap.tick(turns.now_us)
+        throttle(ground)
+    return turns.now_us
 
 
 @dataclass

@@ -7,6 +7,7 @@ import ipaddress
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,10 +21,11 @@ from mavsitl.link.endpoint import open_link
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
 from mavsitl.log.errors import LogError
 from mavsitl.log.tlog import TlogWriter
-from mavsitl.scenario import Flight
+from mavsitl.scenario import Flight, LinkModel
 
 if TYPE_CHECKING:
     from mavsitl.check import Ear, Report, VehiclePort
+    from mavsitl.link.impaired import Channels, ImpairedLink
     from mavsitl.log.ulog import Recorder
 
 WIRE_LOG = "link.tlog"
@@ -50,6 +52,8 @@ class Outcome:
     lateness_us: tuple[float, float] | None = None
     """p50 and p99 of the tick's lateness; real time only."""
     rebased: int = 0
+    link: dict[str, dict[str, float]] | None = None
+    """Of an impaired link, by direction: `mavsitl.link.impaired.Statistics`; None of a perfect one, and the ground."""
 
     @property
     def speed(self) -> float:
@@ -58,6 +62,17 @@ class Outcome:
 
 
 End = Literal["vehicle", "ground"]
+
+IMPAIRED_GRACE_S = 300.0
+"""Over an impaired link a flight in lock-step that takes so much longer than its scenario says will never end."""
+
+
+def _channels(flight: Flight) -> Channels | None:
+    if flight.scenario.link == LinkModel():
+        return None
+    from mavsitl.link.impaired import channels_for  # here, for it loads numpy
+
+    return channels_for(flight.scenario.link, flight.scenario.seed)
 
 
 @contextmanager
@@ -146,8 +161,12 @@ def vehicle_lockstep(
                 flight, recorder, seed=flight.scenario.seed, system_id=system_id, ports=("offboard",), lockstep=True
             )
             watch = _Watch(core)
-            end_us = drivers.run_lockstep_vehicle(core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress)
-            return watch.outcome(end_us, tap)
+            channels = _channels(flight)
+            end_us = drivers.run_lockstep_vehicle(
+                core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
+                channels=channels, max_time_s=flight.scenario.duration_s + IMPAIRED_GRACE_S,
+            )  # fmt: skip
+            return watch.outcome(end_us, tap, channels=channels)
     finally:
         link.close()
 
@@ -170,7 +189,10 @@ def ground_lockstep(
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
-            end_us = drivers.run_lockstep_ground(core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress)
+            end_us = drivers.run_lockstep_ground(
+                core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
+                impaired=flight.scenario.link != LinkModel(),
+            )  # fmt: skip
             return watch.outcome(end_us, tap)
     finally:
         link.close()
@@ -195,6 +217,10 @@ def vehicle_realtime(
                 host_option="--bind HOST",
             )
         )
+        channels = _channels(flight)
+        impaired = None if channels is None else _impaired(opened[0], channels, speed)
+        if impaired is not None:
+            opened[0] = impaired
         opened.append(
             UdpLink(
                 (links.bind, links.gcs_port), links.gcs_remote, port_option="--gcs-port N", host_option="--bind HOST"
@@ -213,6 +239,8 @@ def vehicle_realtime(
                     ports=("offboard", *["gcs"] * (len(opened) - 1)), lockstep=False,
                     state=state, logs=folder, unix_us=_steady_unix_clock(), trusted=is_loopback(links.bind),
                 )  # fmt: skip
+            if impaired is not None:
+                impaired.flight_time_s = lambda: core.flight_time_s
             if herald.sequence:
                 core.continue_from(herald.sequence)
             watch = _Watch(core)
@@ -223,10 +251,18 @@ def vehicle_realtime(
             finally:
                 core.close()
             lateness = (timing.lateness.p50_us, timing.lateness.p99_us)
-            return watch.outcome(timing.simulated_us, tap, lateness, timing.rebased, wall_us=timing.wall_us)
+            return watch.outcome(timing.simulated_us, tap, lateness, timing.rebased, timing.wall_us, channels)
     finally:
         for link in opened:
             link.close()
+
+
+def _impaired(link: Link, channels: Channels, speed: float) -> ImpairedLink:
+    """In wall time times speed, which begins now."""
+    from mavsitl.link.impaired import ImpairedLink
+
+    start_us = monotonic_us()
+    return ImpairedLink(link, channels, lambda: int((monotonic_us() - start_us) * speed))
 
 
 def ground_realtime(
@@ -266,8 +302,10 @@ def in_memory(
         vehicle = wings.find(wings.VEHICLE_GROUP)(flight, vehicle_recorder, seed=flight.scenario.seed, lockstep=True)
         ground = wings.find(wings.GROUND_GROUP)(flight, ground_recorder, report=report)
         watch = _Watch(ground)
-        end_us = drivers.fly_in_memory(vehicle, ground, tap, progress=progress)
-        return watch.outcome(end_us, tap)
+        channels = _channels(flight)
+        limit_s = inf if channels is None else flight.scenario.duration_s + IMPAIRED_GRACE_S
+        end_us = drivers.fly_in_memory(vehicle, ground, tap, max_time_s=limit_s, progress=progress, channels=channels)
+        return watch.outcome(end_us, tap, channels=channels)
 
 
 def is_loopback(host: str) -> bool:
@@ -372,6 +410,7 @@ class _Watch:
         lateness_us: tuple[float, float] | None = None,
         rebased: int = 0,
         wall_us: int | None = None,
+        channels: Channels | None = None,
     ) -> Outcome:
         """`wall_us`: None is since the first exchange."""
         counters = self._core.counters
@@ -386,4 +425,5 @@ class _Watch:
             rejected=counters.rejected,
             lateness_us=lateness_us,
             rebased=rebased,
+            link=None if channels is None else channels.statistics(),
         )

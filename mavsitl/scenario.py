@@ -118,6 +118,65 @@ class Noise(Section, frozen=True):
     rate_deg_s: NonNegative = 0.1
 
 
+Milliseconds = Annotated[float, msgspec.Meta(ge=0.0, le=10_000.0)]
+
+
+class Bursts(Section, frozen=True):
+    """Gilbert and Elliott's two states in simulated time; the time spent in each is exponentially distributed."""
+
+    bad_ms: Milliseconds = 0.0
+    """Mean length of a burst; 0: none."""
+    good_ms: Annotated[float, msgspec.Meta(ge=1.0)] = 2000.0
+    """Mean time between two bursts."""
+    loss_bad: Fraction = 1.0
+    loss_good: Fraction = 0.0
+
+
+class Outage(Section, frozen=True):
+    """Everything sent from `start_s` on is lost, for `duration_s`."""
+
+    start_s: NonNegative
+    duration_s: Positive
+    clock: Literal["flight", "simulated"] = "flight"
+    """Of `start_s`: since the release or the lift-off, or since the vehicle's start."""
+
+
+class Impairment(Section, frozen=True):
+    """What one direction of a link does to the messages on it. The default does nothing."""
+
+    latency_ms: Milliseconds = 0.0
+    jitter_ms: Milliseconds = 0.0
+    """Half the width of ``uniform``, 1 sigma of ``normal`` and ``gamma``; each message has a delay of its own."""
+    distribution: Literal["uniform", "normal", "gamma"] = "normal"
+    """Of the delay, with mean `latency_ms`; ``normal`` is cut at 0."""
+    keep_order: bool = False
+    """True: none overtakes an earlier one, it waits for it; jitter then adds to the mean delay."""
+    loss: Fraction = 0.0
+    """Each message for itself, beside what bursts lose."""
+    bursts: Bursts = Bursts()
+    reorder: Fraction = 0.0
+    """Share of messages held back by `reorder_ms` more, so that later ones overtake them."""
+    reorder_ms: Milliseconds = 20.0
+    duplicate: Fraction = 0.0
+    """Share of messages of which a second copy comes, with a delay of its own."""
+    corrupt: Fraction = 0.0
+    """Share of messages of which one to three bits are flipped."""
+    bandwidth_kbit_s: NonNegative = 0.0
+    """MAVLink bytes alone are counted; 0: unlimited."""
+    queue_bytes: Annotated[int, msgspec.Meta(ge=280, le=1_000_000)] = 8192
+    """Waiting for the bandwidth; what does not fit any more is lost."""
+    outages: tuple[Outage, ...] = ()
+
+
+class LinkModel(Section, frozen=True):
+    """The off-board link, direction by direction; the ground-station link is not touched."""
+
+    to_ground: Impairment = Impairment()
+    """Telemetry and acknowledgements."""
+    to_vehicle: Impairment = Impairment()
+    """Setpoints and commands."""
+
+
 class Hover(Section, frozen=True, tag_field="kind", tag="hover"):
     position_nwu_m: Vector3 = (0.0, 0.0, 1.0)
     yaw_deg: float = 0.0
@@ -239,6 +298,7 @@ class Scenario(Section, frozen=True):
     wind: tuple[Wind, ...] = ()
     """Summed."""
     noise: Noise = Noise()
+    link: LinkModel = LinkModel()
     parameters: dict[str, float] = {}
     """PX4 parameters of the vehicle, over the airframe's."""
     controller: Controller = Controller()
@@ -489,6 +549,19 @@ def _check(scenario: Scenario, where: str) -> None:
         raise ScenarioError(
             f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'"
         )
+    for name in ("to_ground", "to_vehicle"):
+        _check_impairment(getattr(scenario.link, name), f"{where}: link.{name}")
     steps = scenario.reference.steps if isinstance(scenario.reference, Steps) else ()
     if any(later.time_s <= earlier.time_s for earlier, later in pairwise(steps)):
         raise ScenarioError(f"{where}: reference.steps: time_s must increase from step to step")
+
+
+def _check_impairment(impairment: Impairment, where: str) -> None:
+    latency_ms, jitter_ms = impairment.latency_ms, impairment.jitter_ms
+    if impairment.distribution == "uniform" and jitter_ms > latency_ms:
+        raise ScenarioError(
+            f"{where}.jitter_ms: {jitter_ms:g} is not allowed; "
+            f"allowed: at most latency_ms ({latency_ms:g}) with distribution 'uniform'"
+        )
+    if impairment.distribution == "gamma" and jitter_ms > 0.0 and not latency_ms > 0.0:
+        raise ScenarioError(f"{where}.latency_ms: 0 is not allowed; allowed: > 0 with distribution 'gamma' and jitter")

@@ -297,7 +297,7 @@ class Ground:
                 handshake.on_heartbeat(message, frame.system_id, frame.component_id, self._now_us)
             elif handshake.accepts(frame.system_id, frame.component_id):
                 self._observer.receive(message)
-                handshake.on_message(message)
+                handshake.on_message(message, self._now_us)
                 if type(message).id == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
                     sender = (frame.system_id, frame.component_id)
                     for text in self._texts.receive(message, sender, self._now_us):

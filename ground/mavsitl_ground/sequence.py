@@ -15,7 +15,8 @@ from mavsitl.dialect import mavlink
 from mavsitl.services.command import CommandClient
 
 PX4_MAIN_MODE_OFFBOARD = 6
-HEARTBEAT_TIMEOUT_US = 3_000_000
+SILENCE_TIMEOUT_US = 3_000_000
+"""Of every message: on a lossy link three HEARTBEATs in a row are soon lost, and the state still comes."""
 STREAM_TIME_US = 500_000
 """Setpoints flow this long before OFFBOARD is asked for; PX4 wants to see a stream first."""
 RETRY_US = 1_000_000
@@ -74,7 +75,7 @@ class Handshake:
         self._asked: int | None = None
         self._phase_us = 0
         self._retry_us = 0
-        self._heartbeat_us = -1
+        self._heard_us = -1
         self._disarmed_us: int | None = None
         self.phase = Phase.SEARCH
         self.target: tuple[int, int] | None = None
@@ -102,12 +103,13 @@ class Handshake:
             self._report(f"vehicle {system_id} found")
         if self.target != (system_id, component_id):
             return
-        self._heartbeat_us = now_us
+        self._heard_us = now_us
         self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         self.offboard = message.custom_mode >> 16 & 0xFF == PX4_MAIN_MODE_OFFBOARD
 
-    def on_message(self, message: Any) -> None:
+    def on_message(self, message: Any, now_us: int) -> None:
         """From the vehicle that is flown."""
+        self._heard_us = now_us
         if type(message).id == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
             self.landed_state = message.landed_state
         elif type(message).id == mavlink.MAVLINK_MSG_ID_COMMAND_ACK:
@@ -129,8 +131,8 @@ class Handshake:
         self._enter(Phase.STOP, now_us)
 
     def step(self, now_us: int) -> None:
-        if self.target is not None and now_us - self._heartbeat_us > HEARTBEAT_TIMEOUT_US:
-            self.lose(f"no HEARTBEAT for {HEARTBEAT_TIMEOUT_US / 1e6:g} s", now_us)
+        if self.target is not None and now_us - self._heard_us > SILENCE_TIMEOUT_US:
+            self.lose(f"silent for {SILENCE_TIMEOUT_US / 1e6:g} s", now_us)
         _STEPS[self.phase](self, now_us)
         self._client.step(now_us)
 

@@ -9,7 +9,7 @@ from fastcrc import crc16
 from mavsitl.codec import MAX_DATAGRAM_BYTES, SIGNATURE_BYTES
 from mavsitl.dialect import mavlink
 
-__all__ = ["LONGEST_FRAME_BYTES", "StreamSplitter"]
+__all__ = ["LONGEST_FRAME_BYTES", "StreamSplitter", "split_frames"]
 
 LONGEST_FRAME_BYTES = 10 + 255 + 2 + SIGNATURE_BYTES
 """A signed MAVLink 2 frame of the longest payload."""
@@ -21,6 +21,22 @@ _next_magic = re.compile(rb"[\xfd\xfe]").search
 
 _INCOMPLETE = -1
 _REFUSED = 0
+
+
+def split_frames(datagram: bytes) -> list[bytes]:
+    """A datagram's frames by their lengths alone; from where no frame begins, or none ends, the rest in one piece."""
+    pieces = []
+    begin, available = 0, len(datagram)
+    while begin < available:
+        stop = available
+        if datagram[begin] == _MAGIC_V2 and available - begin > 2:
+            signature = SIGNATURE_BYTES if datagram[begin + 2] & _SIGNED else 0
+            stop = begin + 12 + datagram[begin + 1] + signature
+        elif datagram[begin] == _MAGIC_V1 and available - begin > 1:
+            stop = begin + 8 + datagram[begin + 1]
+        pieces.append(datagram[begin:stop])
+        begin = stop
+    return pieces
 
 
 class StreamSplitter:

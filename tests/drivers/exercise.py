@@ -10,6 +10,7 @@ from mavsitl_vehicle.vehicle import Vehicle
 
 from mavsitl import drivers, scenario
 from mavsitl.ends import NullRecorder
+from mavsitl.link.impaired import channels_for
 from mavsitl.log.flight import FlightData
 from mavsitl.log.ulog import MemoryRecorder
 from mavsitl.scenario import Flight
@@ -32,7 +33,8 @@ def fly_in_memory(flight: Flight) -> Flown:
     vehicle = Vehicle(flight, vehicle_log, seed=flight.scenario.seed, lockstep=True)
     ground = Ground(flight, ground_log)
     tap = drivers.Tap()
-    drivers.fly_in_memory(vehicle, ground, tap, max_time_s=flight.scenario.duration_s + 30.0)
+    channels = channels_for(flight.scenario.link, flight.scenario.seed)
+    drivers.fly_in_memory(vehicle, ground, tap, max_time_s=flight.scenario.duration_s + 30.0, channels=channels)
     data = FlightData.from_recorders(vehicle_log, ground_log, duration_s=flight.scenario.duration_s)
     return Flown(tap.wire.hexdigest(), data, ground.phase)
 
@@ -40,7 +42,8 @@ def fly_in_memory(flight: Flight) -> Flown:
 def hash_in_memory(flight: Flight) -> str:
     vehicle = Vehicle(flight, NullRecorder(), seed=flight.scenario.seed, lockstep=True)
     tap = drivers.Tap()
-    drivers.fly_in_memory(vehicle, Ground(flight, NullRecorder()), tap)
+    channels = channels_for(flight.scenario.link, flight.scenario.seed)
+    drivers.fly_in_memory(vehicle, Ground(flight, NullRecorder()), tap, channels=channels)
     return tap.wire.hexdigest()
 
 

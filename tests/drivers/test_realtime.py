@@ -17,6 +17,7 @@ from mavsitl.drivers import Tap
 from mavsitl.ends import NullRecorder, VehicleLinks
 from mavsitl.link.address import Address
 from mavsitl.link.base import Link
+from mavsitl.link.impaired import ImpairedLink, channels_for
 from mavsitl.link.memory import memory_pair
 from mavsitl.link.udp import LOOPBACK
 from tests.drivers.exercise import shortened
@@ -102,6 +103,40 @@ def test_a_vehicle_flies_on_the_wall_clock(wall: Wall, speed: float) -> None:
     assert 2_000_000 < timing.simulated_us < 10_000_000
     assert timing.lateness.count == timing.simulated_us // vehicle.period_us
     assert len(station.receive(0)) > 10
+
+
+def test_a_vehicle_flies_over_a_bad_link_on_the_wall_clock(wall: Wall) -> None:
+    """Latency, loss and duplicates both ways; at twice the speed a simulated latency is half as long on the wall."""
+    bad = {
+        f"link__{way}__{key}": value
+        for way in ("to_ground", "to_vehicle")
+        for key, value in (("latency_ms", 12.0), ("loss", 0.1), ("duplicate", 0.1))
+    }
+    flight = shortened("hover-calm", 1.0, controller__level="attitude", **bad)
+    vehicle = Vehicle(flight, NullRecorder(), seed=1)
+    ground = Ground(flight, NullRecorder())
+    near, far = memory_pair()
+    channels = channels_for(flight.scenario.link, 1)
+    assert channels is not None
+    link = ImpairedLink(near, channels, lambda: 2 * wall.ns // 1000)
+    link.flight_time_s = lambda: vehicle.flight_time_s
+
+    def one_round() -> None:
+        now_us = wall.ns // 1000
+        for datagram, _ in far.receive(now_us):
+            ground.receive(0, datagram)
+        ground.step(now_us)
+        for datagram in ground.datagrams(0, combine=False):
+            far.send(datagram)
+
+    links: Sequence[Any] = (Pumped(link, one_round),)
+    drivers.run_realtime_vehicle(vehicle, links, Tap(), speed=2.0, stop=lambda: ground.finished)
+    assert vehicle.finished
+    assert ground.succeeded
+    for statistics in (channels.to_ground.statistics, channels.to_vehicle.statistics):
+        assert statistics.delay.p50_us == 12_000.0
+        assert 0.05 < statistics.lost / statistics.sent < 0.15
+        assert statistics.duplicated > 10
 
 
 def test_a_ground_flies_on_the_wall_clock(wall: Wall) -> None:

@@ -21,6 +21,7 @@ import msgspec
 
 from mavsitl import drivers, wings
 from mavsitl.drivers import VehicleCore
+from mavsitl.link.impaired import channels_for
 from mavsitl.report.metrics import Rmse
 from mavsitl.scenario import Flight, Waypoints, load
 from tests.experiments.sums import LOST_M, Six, Sums
@@ -30,6 +31,9 @@ DEFAULT_STORE = Path("runs") / "experiments.jsonl"
 GRACE_S = 120.0
 """Simulated time beside the flight itself: handshake, take-off, landing."""
 
+NOT_FLYING = ("report/", "link/", "cli.", "ends.", "pair.", "__main__")
+DECIDING_LINKS = ("link/impaired.py", "link/framing.py")
+"""What of the product does not decide a flight in memory, and what of that does."""
 
 STRETCH_TICKS = 250
 """A flight's rows are summed up, and it is looked at, this often."""
@@ -142,7 +146,7 @@ def source_digest() -> str:
         for folder in (spec.submodule_search_locations or ()) if spec else ():
             for file in sorted(Path(folder).rglob("*.py")):
                 inside = file.relative_to(folder).as_posix()
-                if not inside.startswith(("report/", "link/", "cli.", "ends.", "pair.", "__main__")):
+                if inside in DECIDING_LINKS or not inside.startswith(NOT_FLYING):
                     digest.update(inside.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
 
@@ -163,7 +167,9 @@ def fly(job: Job) -> Outcome:
         vehicle = wings.find(wings.VEHICLE_GROUP)(job.flight, sums.vehicle, seed=job.seed, lockstep=True)
         ground = wings.find(wings.GROUND_GROUP)(job.flight, sums.ground, report=said.append)
         watched = Watched(vehicle, sums)
-        drivers.fly_in_memory(watched, ground, max_time_s=job.flight.scenario.duration_s + GRACE_S)
+        channels = channels_for(job.flight.scenario.link, job.seed)
+        limit_s = job.flight.scenario.duration_s + GRACE_S
+        drivers.fly_in_memory(watched, ground, max_time_s=limit_s, channels=channels)
     except LostError as loss:
         return outcome("lost", str(loss))
     except Exception as error:  # a campaign goes on without this flight, and says so

@@ -13,18 +13,19 @@ import numpy.typing as npt
 from mavsitl.log import topics
 from mavsitl.log.flight import FlightData, FlightError
 from mavsitl.log.ulog import MemoryRecorder
-from mavsitl.scenario import Flight
+from mavsitl.scenario import Flight, LinkModel
 
 LOST_M = 20.0
 """A position error beyond this is a lost flight."""
 
+Table = dict[str, npt.NDArray[Any]]
 Six = tuple[float, float, float, float, float, float]
 
 
 class _Stretch(MemoryRecorder):
     """Gives its rows away."""
 
-    def take(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
+    def take(self) -> dict[str, Table]:
         """The rows since the last time."""
         tables = self.tables()
         for _, sink in self._rows.values():
@@ -42,6 +43,9 @@ class Sums:
         self.vehicle = _Stretch()
         self.ground = _Stretch()
         self._duration_s = flight.scenario.duration_s
+        self._lossy = flight.scenario.link != LinkModel()
+        self._newest: dict[str, Table] = {}
+        """The ground's newest row of each topic that is held."""
         self._first_weights = first_weights(flight)
         self._squares = np.zeros(6)
         self._largest = np.zeros(6)
@@ -72,6 +76,10 @@ class Sums:
             self._released_us = int(land["timestamp"][land["landed"] == 0][0])
         if self._released_us is None or self.lost_s is not None:
             return
+        truth = vehicle.get(topics.LOCAL_POSITION_TRUTH.name)
+        if self._lossy and truth is not None:
+            for topic in (topics.TRAJECTORY_SETPOINT, topics.ATTITUDE_SETPOINT):
+                self._hold(ground, topic.name, truth["timestamp"])
         vehicle[topics.LAND_DETECTED.name] = {
             "timestamp": np.array([self._released_us], np.uint64),
             "landed": np.zeros(1, np.uint8),
@@ -95,8 +103,26 @@ class Sums:
         if stretch.weights is not None:
             known = self._first_weights > 0.0
             ratios = (stretch.weights[:count] / np.where(known, self._first_weights, 1.0))[:, known]
+            if np.isnan(ratios).all():  # none has come over a bad link yet
+                return
             low, high = self.weight_range
             self.weight_range = (min(low, float(np.nanmin(ratios))), max(high, float(np.nanmax(ratios))))
+
+    def _hold(self, ground: dict[str, Table], name: str, stamps: npt.NDArray[np.uint64]) -> None:
+        """At each stamp the ground's newest row that is not younger, so that what a link loses is not left out."""
+        table = ground.get(name)
+        kept = self._newest.get(name)
+        if table is None or not len(table["timestamp"]):
+            table = kept
+        elif kept is not None:
+            table = {column: np.concatenate((kept[column], table[column])) for column in table}
+        if table is None:
+            return
+        self._newest[name] = {column: values[-1:] for column, values in table.items()}
+        rows = np.searchsorted(table["timestamp"], stamps, side="right") - 1
+        known = rows >= 0
+        ground[name] = {column: values[rows[known]] for column, values in table.items()}
+        ground[name]["timestamp"] = stamps[known]
 
 
 def first_weights(flight: Flight) -> npt.NDArray[np.float64]:

@@ -15,7 +15,7 @@ from mavsitl.log.flight import FlightData
 from mavsitl.log.ulog import MemoryRecorder
 from mavsitl.report.metrics import PAPER_TABLES, maximum_error, rmse
 from tests.bench import bench_lockstep
-from tests.experiments import engine, learning, limits, results, stability
+from tests.experiments import engine, learning, limits, links, results, stability
 from tests.experiments.engine import Job, Outcome
 from tests.experiments.sums import first_weights
 
@@ -203,3 +203,38 @@ def test_limits_changes_one_thing_at_a_time(capsys: pytest.CaptureFixture[str]) 
 
 def test_the_rival_of_the_benchmark_hovers() -> None:
     assert isfinite(bench_lockstep.fly_rival(0.5))
+
+
+def test_a_link_does_not_change_what_is_measured() -> None:
+    """Channels that do nothing leave the sums as they are; what the ground does not hear of is measured, too."""
+    perfect = engine.fly(engine.job("hover-wind", SHORT, 1))
+    through = engine.fly(engine.job("hover-wind", SHORT | links.both(queue_bytes=9000), 1))
+    assert through.flown
+    assert through.rmse == perfect.rmse
+    silent = {"duration_s": 4.0, "link.to_vehicle.loss": 1.0, "link.to_ground.loss": 0.0}
+    assert engine.fly(engine.job("hover-wind", silent, 1)).status == "failed"  # never armed
+    outage = [{"start_s": 1.0, "duration_s": 1000.0}]
+    gone = SHORT | {"duration_s": 60.0, "controller.level": "torque"} | links.both(outages=outage)
+    lost = engine.fly(engine.job("hover-wind", gone, 1))
+    assert lost.status == "lost"
+    assert lost.largest is not None
+    assert max(map(abs, lost.largest)) > 1.0
+
+
+def test_links_has_every_link_and_level(capsys: pytest.CaptureFixture[str]) -> None:
+    assert links.main(["--quick", "--jobs", "1"]) == 0
+    page = capsys.readouterr().out
+    rows = [line for line in page.splitlines() if line.startswith(tuple(f"| {link} |" for link in links.LINKS))]
+    assert len(rows) == len(links.LINKS)
+    assert all(row.count("|") == len(links.LEVELS) + 2 for row in rows)
+    values = [cell.split() for cell in rows[0].split("|")[2:-1]]
+    assert all(float(metres) < 0.1 and unit == "m," and angle.endswith("°") for metres, unit, angle in values)
+    assert "lost" in rows[2]
+
+
+def test_links_counts_lost_flights_beside_the_median() -> None:
+    flown = [Outcome("", "hover-wind", seed, "flown", 60.0, (0.3, 0.4, 0.0, 0.0, 3.0, 4.0)) for seed in (1, 2)]
+    lost = Outcome("", "hover-wind", 3, "lost", 3.0)
+    assert links.cell(flown) == "0.500 m, 5.00°"
+    assert links.cell([*flown, lost]) == "0.500 m, 5.00° (1 of 3 lost)"
+    assert links.cell([flown[0], lost, lost]) == "lost"

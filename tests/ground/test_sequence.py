@@ -62,7 +62,7 @@ def test_a_vehicle_that_goes_and_comes_back_is_flown_again(system_id: int) -> No
     air = in_flight()
     air.vehicle = None
     assert air.reaches("SEARCH", within_s=3.5)
-    assert "vehicle lost: no HEARTBEAT for 3 s" in air.said
+    assert "vehicle lost: silent for 3 s" in air.said
     assert air.ground.vehicle_time_us == -1
     assert air.ground.flight_time_s == -1.0
     sent = len(air.from_ground)
@@ -211,6 +211,23 @@ def test_the_oracle_does_not_fly_blind() -> None:
         handshake.step(now_us)
         if sent:
             sent.clear()
-            handshake.on_message(refusal)
+            handshake.on_message(refusal, now_us)
     assert handshake.phase is Phase.ABORTED
     assert said[-1] == f"no flight without message {WIND_ID}: the scenario needs it"
+
+
+def test_a_vehicle_whose_heartbeats_are_lost_is_there_as_long_as_anything_comes() -> None:
+    said: list[str] = []
+    handshake = Handshake(lambda command, confirmation, params: None, [], land=True, report=said.append)
+    heartbeat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
+    handshake.on_heartbeat(heartbeat, 1, 1, 0)
+    state = mavlink.MAVLink_attitude_message(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for now_us in range(0, 10_000_001, 100_000):
+        handshake.on_message(state, now_us)
+        handshake.step(now_us)
+    assert handshake.target == (1, 1)
+    handshake.step(13_000_000)
+    assert handshake.target == (1, 1)
+    handshake.step(13_000_001)
+    assert handshake.target is None
+    assert said[-1] == "vehicle lost: silent for 3 s"

@@ -149,6 +149,42 @@ REFUSED = {
         '[controller]\ninner = "pidnn"',
         "controller.inner: 'pidnn' needs controller.level 'attitude', not 'body_rate'",
     ),
+    "unknown key of a link": (
+        "[link.to_ground]\nlatency_s = 0.1",
+        "link.to_ground.latency_s: unknown key; allowed here: latency_ms, jitter_ms, distribution, keep_order, loss,",
+    ),
+    "unknown direction of a link": (
+        "[link.up]\nlatency_ms = 1",
+        "link.up: unknown key; allowed here: to_ground, to_vehicle",
+    ),
+    "loss in percent": (
+        "[link.to_vehicle]\nloss = 20",
+        "link.to_vehicle.loss: 20 is not allowed; allowed: number >= 0 and <= 1",
+    ),
+    "latency beyond its range": (
+        "[link.to_vehicle]\nlatency_ms = 20000",
+        "link.to_vehicle.latency_ms: 20000 is not allowed; allowed: number >= 0 and <= 10000",
+    ),
+    "queue shorter than a message": (
+        "[link.to_vehicle]\nqueue_bytes = 100",
+        "link.to_vehicle.queue_bytes: 100 is not allowed; allowed: whole number >= 280 and <= 1e+06",
+    ),
+    "unknown distribution": (
+        '[link.to_ground]\ndistribution = "pareto"',
+        "link.to_ground.distribution: 'pareto' is not allowed; allowed: 'gamma', 'normal', 'uniform'",
+    ),
+    "uniform delays before the sending": (
+        '[link.to_ground]\ndistribution = "uniform"\nlatency_ms = 5\njitter_ms = 10',
+        "link.to_ground.jitter_ms: 10 is not allowed; allowed: at most latency_ms (5) with distribution 'uniform'",
+    ),
+    "gamma without a mean": (
+        '[link.to_ground]\ndistribution = "gamma"\njitter_ms = 10',
+        "link.to_ground.latency_ms: 0 is not allowed; allowed: > 0 with distribution 'gamma' and jitter",
+    ),
+    "outage without an end": (
+        "[link.to_ground]\noutages = [{ start_s = 1 }]",
+        "link.to_ground.outages[0].duration_s: missing; allowed: number > 0",
+    ),
     "steps out of order": (
         f'[reference]\nkind = "steps"\nsteps = [{STEP_AT % 2}, {STEP_AT % 1}]',
         "reference.steps: time_s must increase from step to step",
@@ -278,6 +314,7 @@ KEYS = [
     "kind",
     "steps",
 ]
+KEYS += ["link", "to_ground", "latency_ms", "jitter_ms", "distribution", "bursts", "outages"]
 KEYS += ["parameters", "controller", "law", "learning", "projection", "altitude", "yaw", "k_p_per_s2", "duration_s"]
 leaves = (
     st.none()
