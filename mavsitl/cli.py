@@ -244,6 +244,14 @@ def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def _add_scenario(parser: argparse.ArgumentParser, what: str) -> None:
+    """The one scenario of a process that stands alone; `what` it takes from it."""
+    parser.add_argument(
+        "scenario", nargs="?", default="takeoff-hover", metavar="SCENARIO", help=f"{what} (default: takeoff-hover)"
+    )
+    _add_scenario_options(parser)
+
+
 def _add_fly(commands: Any) -> None:
     parser = _command(
         commands, "fly", "fly scenarios with two processes in lock-step, and report", FLY_HELP, FLY_EXAMPLES
@@ -260,14 +268,7 @@ def _add_fly(commands: Any) -> None:
 
 def _add_vehicle(commands: Any) -> None:
     parser = _command(commands, "vehicle", "start a vehicle alone", VEHICLE_HELP, VEHICLE_EXAMPLES)
-    parser.add_argument(
-        "scenario",
-        nargs="?",
-        default="takeoff-hover",
-        metavar="SCENARIO",
-        help="its airframe, air, start (default: takeoff-hover)",
-    )
-    _add_scenario_options(parser)
+    _add_scenario(parser, "its airframe, air, start")
     group = parser.add_argument_group("link")
     group.add_argument(
         "--instance",
@@ -315,14 +316,7 @@ def _add_vehicle(commands: Any) -> None:
 
 def _add_ground(commands: Any) -> None:
     parser = _command(commands, "ground", "start the off-board controller alone", GROUND_HELP, GROUND_EXAMPLES)
-    parser.add_argument(
-        "scenario",
-        nargs="?",
-        default="takeoff-hover",
-        metavar="SCENARIO",
-        help="its controller and reference (default: takeoff-hover)",
-    )
-    _add_scenario_options(parser)
+    _add_scenario(parser, "its controller and reference")
     group = parser.add_argument_group("link")
     group.add_argument(
         "--link",

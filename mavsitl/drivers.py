@@ -35,6 +35,9 @@ MAX_OUT_OF_STEP = 1000
 PROGRESS_INTERVAL_US = 100_000
 """Wall clock between two calls of a progress callback."""
 SETUP_SIGNING = 256
+"""Its message id."""
+SETUP_SIGNING_ID = SETUP_SIGNING.to_bytes(3, "little")
+"""As a MAVLink 2 header has it; where the bytes stand elsewhere, looking closer does no harm."""
 FLUSH_INTERVAL_US = 1_000_000
 CHECK_WAIT_S, NO_SOCKET_WAIT_S = 0.02, 0.002
 """Of a check: longest wait for a datagram; and a pause where there is nothing to wait for, a server not there yet."""
@@ -116,10 +119,6 @@ class Tap:
                 self.flush(now_us)
             if self.tlog is not None:
                 self.tlog.flush()
-
-
-SETUP_SIGNING_ID = b"\x00\x01\x00"
-"""Message id 256 as a MAVLink 2 header has it; where the bytes stand elsewhere, looking closer does no harm."""
 
 
 def _without_keys(datagram: bytes) -> bytes:
@@ -294,7 +293,7 @@ class _Exchanges:
     def __call__(self, now_us: int, messages: list[bytes]) -> tuple[list[bytes], bool]:
         if not self._met:
             self._link.send(HELLO)
-            if self._receive(now_us, self._start_deadline_s, HELLO) != HELLO:
+            if self._receive(now_us, self._start_deadline_s, repeated=HELLO) != HELLO:
                 unpack(b"")  # says what is wrong
             self._met = True
             self._pin()
@@ -305,17 +304,24 @@ class _Exchanges:
         return unpack(answer)
 
     def _receive(self, now_us: int, limit_s: float, repeated: bytes | None = None) -> bytes:
-        patience = round(limit_s / FIRST_REPEAT_S)
-        while True:
-            try:
-                return self._link.receive()
-            except LinkSilent as silence:
-                self._throttle.now(self._vehicle)
-                patience -= 1
-                if patience <= 0:
-                    raise _stopped(now_us, limit_s, silence) from silence
-                if repeated is not None:
-                    self._link.send(repeated)
+        return _receive(self._link, self._vehicle, self._throttle, now_us, limit_s, repeated)
+
+
+def _receive(
+    link: ConnectedUdp, core: Core, throttle: _Throttle, now_us: int, limit_s: float, repeated: bytes | None = None
+) -> bytes:
+    """The next datagram, waited for `limit_s` while progress is shown; `repeated` is sent again at each time-out."""
+    patience = round(limit_s / FIRST_REPEAT_S)
+    while True:
+        try:
+            return link.receive()
+        except LinkSilent as silence:
+            throttle.now(core)
+            patience -= 1
+            if patience <= 0:
+                raise _stopped(now_us, limit_s, silence) from silence
+            if repeated is not None:
+                link.send(repeated)
 
 
 def _stopped(now_us: int, limit_s: float, silence: LinkSilent) -> LinkSilent:
@@ -408,18 +414,9 @@ def run_lockstep_ground(
     now_us = 0
     last = b""
     limit_s = start_deadline_s
-    patience = round(limit_s / FIRST_REPEAT_S)
     while not ground.finished:
-        try:
-            datagram = link.receive()
-        except LinkSilent as silence:
-            throttle.now(ground)
-            patience -= 1
-            if patience <= 0:
-                raise _stopped(now_us, limit_s, silence) from silence
-            continue
+        datagram = _receive(link, ground, throttle, now_us, limit_s)
         limit_s = deadline_s
-        patience = round(limit_s / FIRST_REPEAT_S)
         if datagram == last:  # the vehicle repeats its first until it is answered
             continue
         last = datagram
@@ -444,18 +441,9 @@ def _ground_impaired(
 ) -> int:  # fmt: skip
     turns = _GroundTurns(ground)
     limit_s = start_deadline_s
-    patience = round(limit_s / FIRST_REPEAT_S)
     while not ground.finished:
-        try:
-            datagram = link.receive()
-        except LinkSilent as silence:
-            throttle.now(ground)
-            patience -= 1
-            if patience <= 0:
-                raise _stopped(max(turns.now_us, 0), limit_s, silence) from silence
-            continue
+        datagram = _receive(link, ground, throttle, max(turns.now_us, 0), limit_s)
         limit_s = deadline_s
-        patience = round(limit_s / FIRST_REPEAT_S)
         if datagram == HELLO:
             link.send(HELLO)
             continue

@@ -44,6 +44,16 @@ class Sitl:
         return Path(self.output.name).read_text("utf-8")
 
 
+def await_end(process: subprocess.Popen[Any]) -> int:
+    """The exit code of a process that was told to end; one that does not is killed, and that is an error."""
+    try:
+        return process.wait(PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        raise
+
+
 @contextmanager
 def sitl(
     scenario: str = "takeoff-hover",
@@ -78,12 +88,7 @@ def sitl(
         finally:
             _running.remove(vehicle)
             process.terminate()
-            try:
-                process.wait(PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                raise
+            await_end(process)
         assert process.returncode == 0, vehicle.log()
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO
 
 from mavsitl.clock import monotonic_us
-from tests.interop.conftest import PATIENCE_S
+from tests.interop.conftest import PATIENCE_S, await_end
 
 
 class Program:
@@ -66,11 +66,7 @@ class Program:
         """Close its input, which most programs take for a farewell; the exit code."""
         self._stdin.close()
         try:
-            return self._process.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-            raise
+            return await_end(self._process)
         finally:
             self._reader.join()
             self._stdout.close()
@@ -114,9 +110,4 @@ def server(command: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
             raise
         finally:
             process.terminate()
-            try:
-                process.wait(PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                raise
+            await_end(process)

@@ -13,7 +13,7 @@ from mavsitl.geodesy import Origin
 from mavsitl.routing import Router
 from mavsitl.scenario import Flight
 from mavsitl.services.statustext import TextLimiter, chunks
-from mavsitl_vehicle.autopilot import commands, modes, setpoints, telemetry
+from mavsitl_vehicle.autopilot import modes, setpoints, telemetry
 from mavsitl_vehicle.autopilot.battery import Battery, Level
 from mavsitl_vehicle.autopilot.battery import settings as battery_settings
 from mavsitl_vehicle.autopilot.commander import ACCEPTED, Commander, Situation
@@ -25,7 +25,7 @@ from mavsitl_vehicle.autopilot.navigator import Navigator
 from mavsitl_vehicle.autopilot.parameters import Parameters
 from mavsitl_vehicle.autopilot.pilot import Pilot
 from mavsitl_vehicle.autopilot.plan_watch import PlanWatch
-from mavsitl_vehicle.autopilot.ports import Port, Shared, component_metadata
+from mavsitl_vehicle.autopilot.ports import COMPONENT_ID, Port, Shared, component_metadata
 from mavsitl_vehicle.autopilot.position import PositionControl
 from mavsitl_vehicle.autopilot.setpoints import (
     AttitudeSetpoint,
@@ -132,7 +132,6 @@ class Autopilot:
         """A fail-safe holds the vehicle."""
         self._cascade = False
         """The position cascade flew in the last period."""
-        self._lift_us: int | None = None
         self._texts: list[Message] = []
         self._text_id = 0
         self._limiter = TextLimiter()
@@ -143,7 +142,7 @@ class Autopilot:
         self._housekept_us = -HOUSEKEEPING_US
         self._plan_watch = PlanWatch(shared.plan, self.origin, parameters, lambda text: self.warn("mission", text))
         self._fence_breach: str | None = None
-        self._router = Router(len(port_names), (system_id, mavlink.MAV_COMP_ID_AUTOPILOT1))
+        self._router = Router(len(port_names), (system_id, COMPONENT_ID))
         self.ports = tuple(Port(name, index, self, shared, lockstep=lockstep) for index, name in enumerate(port_names))
         self._handlers = {
             mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: self._on_attitude_target,
@@ -259,9 +258,6 @@ class Autopilot:
     def height_of(self, altitude_amsl_m: float) -> float:
         """Above the local origin; NaN stays."""
         return altitude_amsl_m - self.origin.altitude_amsl_m
-
-    def local_of(self, where: commands.Place) -> tuple[float, float]:
-        return self.origin.to_local(where.latitude_deg, where.longitude_deg)
 
     def local_at(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         return self.origin.to_local(latitude_deg, longitude_deg)
@@ -390,7 +386,6 @@ class Autopilot:
         self._now_us = now_us
         self._look_us = now_us + LOOK_US
         setpoint_us, sticks_us, gcs_us = self.setpoint_us, self.pilot.received_us, self._gcs_us
-        was_armed = self.commander.armed
         self.commander.step(
             now_us,
             Situation(
@@ -399,7 +394,7 @@ class Autopilot:
                 None if sticks_us is None else now_us - sticks_us,
                 None if gcs_us is None else now_us - gcs_us,
                 self.mission_refusal,
-                None if was_armed else self._health_refusal,
+                None if self.commander.armed else self._health_refusal,
                 int(self.battery.level),
                 self._fence_breach,
             ),
@@ -407,7 +402,7 @@ class Autopilot:
 
     def decide(self, now_us: int) -> Setpoint | None:
         """Before the physics: step the commander, and the setpoint for the inner loops; None stops the rotors."""
-        if now_us - self._housekept_us >= HOUSEKEEPING_US or now_us < self._housekept_us:
+        if now_us - self._housekept_us >= HOUSEKEEPING_US:
             self._keep_house(now_us)
         if now_us >= self._look_us:
             self._step_commander(now_us)

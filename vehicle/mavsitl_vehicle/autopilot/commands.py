@@ -174,7 +174,7 @@ def _takeoff(autopilot: Autopilot, command: Command, now_us: int, port: Port) ->
         yaw = command.params[3]
         autopilot.navigator.set_takeoff(
             autopilot.height_of(altitude) if isfinite(altitude) else None,
-            autopilot.local_of(where) if where.has_position else None,
+            autopilot.local_at(where.latitude_deg, where.longitude_deg) if where.has_position else None,
             -radians(yaw) if isfinite(yaw) and command.params[3] != 0.0 else None,
         )
     return result
@@ -193,7 +193,7 @@ def _reposition(autopilot: Autopilot, command: Command, now_us: int, port: Port)
         return _deny(autopilot, "Reposition refused: not armed", TEMPORARILY_REJECTED)
     if autopilot.on_ground:
         return _deny(autopilot, "Reposition refused: landed", TEMPORARILY_REJECTED)
-    x, y = autopilot.local_of(where) if where.has_position else (nan, nan)
+    x, y = autopilot.local_at(where.latitude_deg, where.longitude_deg) if where.has_position else (nan, nan)
     z = autopilot.height_of(where.altitude_amsl_m)
     if reason := autopilot.breach_at(x, y, z):
         return _deny(autopilot, f"Reposition refused: {reason}")
@@ -231,7 +231,7 @@ def _orbit(autopilot: Autopilot, command: Command, now_us: int, port: Port) -> i
         return _deny(
             autopilot, f"Orbit refused: radius {radius:g} m, need {MIN_ORBIT_RADIUS_M:g} to {MAX_ORBIT_RADIUS_M:g}"
         )
-    centre = autopilot.local_of(where) if where.has_position else None
+    centre = autopilot.local_at(where.latitude_deg, where.longitude_deg) if where.has_position else None
     height = autopilot.height_of(where.altitude_amsl_m)
     result = autopilot.request_mode(Mode.ORBIT, "orbit", now_us)
     if result == ACCEPTED:
