@@ -481,11 +481,13 @@ def run_realtime_vehicle(
     stop: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
     wait: Callable[[Sequence[Link], float], bool] = wait_any,
+    due_s: Callable[[], float] = lambda: math.inf,
 ) -> RealTime:
     """The vehicle on the wall clock, times `speed`. `links` in the order of its ports; peers join by a valid frame.
 
     Physics, streams and decisions keep to the ticks. What comes between two of them is taken at once, and what the
-    services answer to it is sent at once. `wait` tells whether something came within a time in seconds.
+    services answer to it is sent at once. `wait` tells whether something came within a time in seconds. `due_s`: in so
+    many seconds an impaired link has something to hand over.
     """
     clock = PacedClock(vehicle.period_us, speed)
     clock.start()
@@ -515,7 +517,11 @@ def run_realtime_vehicle(
         next_us = now_us + vehicle.period_us
         for _ in range(WAKES):
             spare_s = clock.spare_s(next_us)
-            if spare_s <= GUARD_S or not wait(links, spare_s - WAKE_S) or clock.spare_s(next_us) <= GUARD_S:
+            if spare_s <= GUARD_S:
+                break
+            limit_s, soon_s = spare_s - WAKE_S, due_s()
+            came = wait(links, min(limit_s, soon_s)) or soon_s < limit_s
+            if not came or clock.spare_s(next_us) <= GUARD_S:
                 break
             take()
             send()

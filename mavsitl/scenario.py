@@ -119,6 +119,7 @@ class Noise(Section, frozen=True):
 
 
 Milliseconds = Annotated[float, msgspec.Meta(ge=0.0, le=10_000.0)]
+QueueBytes = Annotated[int, msgspec.Meta(ge=280, le=1_000_000)]
 
 
 class Bursts(Section, frozen=True):
@@ -163,18 +164,56 @@ class Impairment(Section, frozen=True):
     """Share of messages of which one to three bits are flipped."""
     bandwidth_kbit_s: NonNegative = 0.0
     """MAVLink bytes alone are counted; 0: unlimited."""
-    queue_bytes: Annotated[int, msgspec.Meta(ge=280, le=1_000_000)] = 8192
+    queue_bytes: QueueBytes = 8192
     """Waiting for the bandwidth; what does not fit any more is lost."""
     outages: tuple[Outage, ...] = ()
+    down: bool = False
+    """Everything is lost, until it is changed."""
+
+
+class LinkChange(Section, frozen=True):
+    """From `at_s` on the keys that stand here hold, for what is sent then; the others stay as they are."""
+
+    at_s: NonNegative
+    clock: Literal["flight", "simulated"] = "flight"
+    """Of `at_s`, as in `outages`. The next flight of the same vehicle goes through its changes again."""
+    direction: Literal["both", "to_ground", "to_vehicle"] = "both"
+    latency_ms: Milliseconds | None = None
+    jitter_ms: Milliseconds | None = None
+    distribution: Literal["uniform", "normal", "gamma"] | None = None
+    keep_order: bool | None = None
+    loss: Fraction | None = None
+    bursts: Bursts | None = None
+    reorder: Fraction | None = None
+    reorder_ms: Milliseconds | None = None
+    duplicate: Fraction | None = None
+    corrupt: Fraction | None = None
+    bandwidth_kbit_s: NonNegative | None = None
+    queue_bytes: QueueBytes | None = None
+    down: bool | None = None
+
+    def of(self, impairment: Impairment) -> Impairment:
+        """What a direction's impairment becomes."""
+        given = {key: value for key in _CHANGEABLE if (value := getattr(self, key)) is not None}
+        return msgspec.structs.replace(impairment, **given)
+
+
+_CHANGEABLE = tuple(key for key in LinkChange.__struct_fields__ if key in Impairment.__struct_fields__)
 
 
 class LinkModel(Section, frozen=True):
-    """The off-board link, direction by direction; the ground-station link is not touched."""
+    """A link, direction by direction."""
 
     to_ground: Impairment = Impairment()
     """Telemetry and acknowledgements."""
     to_vehicle: Impairment = Impairment()
     """Setpoints and commands."""
+    changes: tuple[LinkChange, ...] = ()
+    """What changes as time goes, in this order."""
+    live: bool = False
+    """True: in lock-step the exchange is that of an impaired link even if nothing is impaired yet, so that parameters
+    may change it. Any other key that is not the default does the same; in real time they always may.
+    """
 
 
 class Hover(Section, frozen=True, tag_field="kind", tag="hover"):
@@ -299,6 +338,9 @@ class Scenario(Section, frozen=True):
     """Summed."""
     noise: Noise = Noise()
     link: LinkModel = LinkModel()
+    """The off-board link."""
+    gcs_link: LinkModel = LinkModel()
+    """Each of the ground stations' links, over UDP and TCP; there is none in lock-step."""
     parameters: dict[str, float] = {}
     """PX4 parameters of the vehicle, over the airframe's."""
     controller: Controller = Controller()
@@ -549,11 +591,25 @@ def _check(scenario: Scenario, where: str) -> None:
         raise ScenarioError(
             f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'"
         )
-    for name in ("to_ground", "to_vehicle"):
-        _check_impairment(getattr(scenario.link, name), f"{where}: link.{name}")
+    _check_link(scenario.link, f"{where}: link")
+    _check_link(scenario.gcs_link, f"{where}: gcs_link")
     steps = scenario.reference.steps if isinstance(scenario.reference, Steps) else ()
     if any(later.time_s <= earlier.time_s for earlier, later in pairwise(steps)):
         raise ScenarioError(f"{where}: reference.steps: time_s must increase from step to step")
+
+
+def _check_link(model: LinkModel, where: str) -> None:
+    for name in ("to_ground", "to_vehicle"):
+        impairment: Impairment = getattr(model, name)
+        _check_impairment(impairment, f"{where}.{name}")
+        for index, change in enumerate(model.changes):
+            if change.direction in ("both", name):
+                impairment = change.of(impairment)
+                _check_impairment(impairment, f"{where}.changes[{index}]")
+    for clock in ("flight", "simulated"):
+        times_s = [change.at_s for change in model.changes if change.clock == clock]
+        if any(later < earlier for earlier, later in pairwise(times_s)):
+            raise ScenarioError(f"{where}.changes: at_s must not decrease from change to change (clock = '{clock}')")
 
 
 def _check_impairment(impairment: Impairment, where: str) -> None:

@@ -2,30 +2,31 @@
 
 Each message has a fate of its own, as a real link carries one message a datagram: a datagram of several frames is cut
 into them. What happens to the n-th message depends on the seed, the direction, n and the time it is sent at, not on
-the wall clock. Delays end at the driver's next look, one control period later at most.
+the wall clock. Delays end at the driver's next look: in lock-step one control period later at most.
 """
 
 from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from heapq import heappop, heappush
 from math import inf
-from typing import Any, Literal
+from typing import Any
 
 from mavsitl import seeds
 from mavsitl.clock import LatenessHistogram
 from mavsitl.link.base import MAX_RECEIVED, Link, Source
 from mavsitl.link.framing import split_frames
-from mavsitl.scenario import Impairment, LinkModel
+from mavsitl.link.settings import AS_IN_SCENARIO, DirectionName, Overlay
+from mavsitl.scenario import Impairment, LinkChange, LinkModel
 
-__all__ = ["MAX_IN_FLIGHT", "Channel", "Channels", "ImpairedLink", "Statistics", "channels_for"]
+__all__ = ["MAX_IN_FLIGHT", "PLACES", "Channel", "Channels", "ImpairedLink", "Statistics", "channels_for"]
 
 MAX_IN_FLIGHT = 20_000
 """Messages on their way in one direction, at most; further ones are lost and counted as queue drops."""
 
-DirectionName = Literal["to_ground", "to_vehicle"]
+PLACES = ("link", "gcs_link", "tcp_link")
+"""Links by the names of their random numbers: off-board, ground stations over UDP and over TCP."""
 
 _BLOCK = 512
 _FOR_EVER_US = 1 << 62
@@ -73,8 +74,8 @@ _COUNTS = ("sent", "delivered", "lost", "outage", "queue_drops", "corrupted", "d
 class _Draws:
     """One generator's numbers, drawn in blocks; `shape` is gamma's."""
 
-    def __init__(self, seed: int, direction: str, name: str, kind: str = "uniform") -> None:
-        self._generator = seeds.generator(seed, "link", direction, name)
+    def __init__(self, seed: int, place: str, direction: str, name: str, kind: str = "uniform") -> None:
+        self._generator = seeds.generator(seed, place, direction, name)
         self._kind = kind
         self._shape = 0.0
         self._waiting: list[float] = []
@@ -103,18 +104,21 @@ class Channel:
         statistics: what became of the messages so far.
     """
 
-    def __init__(self, impairment: Impairment, seed: int, direction: DirectionName) -> None:
+    def __init__(self, impairment: Impairment, seed: int, direction: DirectionName, place: str = "link") -> None:
+        """`place`: one of `PLACES`; each has random numbers of its own."""
         self.statistics = Statistics()
         self.flight_began_us: int | None = None
         # A stream for each effect, so that switching one on leaves the others' draws as they are.
-        self._loss = _Draws(seed, direction, "loss")
-        self._burst_loss = _Draws(seed, direction, "burst loss")
-        self._burst_time = _Draws(seed, direction, "burst time", "exponential")
-        self._reorder = _Draws(seed, direction, "reorder")
-        self._duplicate = _Draws(seed, direction, "duplicate")
-        self._corrupt = _Draws(seed, direction, "corrupt")
-        self._flip = _Draws(seed, direction, "flip")
-        self._delays = {kind: _Draws(seed, direction, f"delay {kind}", kind) for kind in ("uniform", "normal", "gamma")}
+        self._loss = _Draws(seed, place, direction, "loss")
+        self._burst_loss = _Draws(seed, place, direction, "burst loss")
+        self._burst_time = _Draws(seed, place, direction, "burst time", "exponential")
+        self._reorder = _Draws(seed, place, direction, "reorder")
+        self._duplicate = _Draws(seed, place, direction, "duplicate")
+        self._corrupt = _Draws(seed, place, direction, "corrupt")
+        self._flip = _Draws(seed, place, direction, "flip")
+        self._delays = {
+            kind: _Draws(seed, place, direction, f"delay {kind}", kind) for kind in ("uniform", "normal", "gamma")
+        }
         self._heap: list[tuple[int, int, int, int, bytes, Any]] = []
         """(due, number of the piece, number of the push, sent, piece, tag)"""
         self._number = self._pushed = 0
@@ -125,6 +129,7 @@ class Channel:
         self._last_due_us = 0
         self._bad = False
         self._state_ends_us = -inf
+        self.impairment = impairment
         self.configure(impairment)
 
     @property
@@ -132,10 +137,19 @@ class Channel:
         """Messages sent and not yet taken."""
         return len(self._heap)
 
+    @property
+    def next_due_us(self) -> float:
+        """When the next message arrives; infinite where none is on its way."""
+        return self._heap[0][0] if self._heap else inf
+
     def configure(self, impairment: Impairment) -> None:
-        """Change what is done to messages sent from now on. Those on their way keep their fate."""
+        """Change what is done to messages sent from now on. Those on their way keep their fate.
+
+        Bursts go on as they are unless they are changed themselves; then they begin anew, with a good stretch.
+        """
+        if impairment.bursts != self.impairment.bursts:
+            self._state_ends_us = -inf
         self.impairment = impairment
-        self._state_ends_us = -inf
         self._byte_us = 8e3 / impairment.bandwidth_kbit_s if impairment.bandwidth_kbit_s > 0.0 else 0.0
 
     def send(self, datagram: bytes, now_us: int, tag: Any = None) -> None:
@@ -205,6 +219,8 @@ class Channel:
         heappush(self._heap, (due_us, number, self._pushed, sent_us, piece, tag))
 
     def _out(self, now_us: int) -> bool:
+        if self.impairment.down:
+            return True
         for outage in self.impairment.outages:
             origin_us = self.flight_began_us if outage.clock == "flight" else 0
             if origin_us is not None:
@@ -236,9 +252,11 @@ class Channel:
             return mean_us
         draw = self._delays[settings.distribution]
         if settings.distribution == "uniform":
-            return mean_us + jitter_us * (2.0 * draw() - 1.0)
+            return max(0.0, mean_us + jitter_us * (2.0 * draw() - 1.0))
         if settings.distribution == "normal":
             return max(0.0, mean_us + jitter_us * draw())
+        if not mean_us:  # no scenario has it, parameters may
+            return 0.0
         shape = (mean_us / jitter_us) * (mean_us / jitter_us)
         return mean_us / shape * draw(shape)
 
@@ -254,20 +272,52 @@ class Channel:
         return bytes(damaged)
 
 
-@dataclass
 class Channels:
-    """Both directions of the off-board link, as the vehicle's end has them."""
+    """Both directions of a link, as the vehicle's end has them, through what the scenario and parameters change.
 
-    to_ground: Channel
-    to_vehicle: Channel
+    What holds is the scenario's, as its changes have made it, under the parameters' overlay.
+    """
+
+    def __init__(self, model: LinkModel, seed: int, place: str = "link") -> None:
+        """`place`: one of `PLACES`."""
+        self.to_ground = Channel(model.to_ground, seed, "to_ground", place)
+        self.to_vehicle = Channel(model.to_vehicle, seed, "to_vehicle", place)
+        self._base: dict[DirectionName, Impairment] = {"to_ground": model.to_ground, "to_vehicle": model.to_vehicle}
+        self._overlay = AS_IN_SCENARIO
+        self._changes = model.changes
+        self._by_flight = _Timeline(model, "flight")
+        self._by_time = _Timeline(model, "simulated")
+
+    def channel(self, direction: DirectionName) -> Channel:
+        return self.to_ground if direction == "to_ground" else self.to_vehicle
 
     def fly(self, now_us: int, flight_time_s: float) -> None:
-        """Tell the time of flight, negative before the release."""
+        """Tell the time of flight, negative before the release; what the scenario changes by now is changed."""
         if flight_time_s < 0.0:
             began_us = None
         else:
             began_us = now_us - round(flight_time_s * 1e6)
         self.to_ground.flight_began_us = self.to_vehicle.flight_began_us = began_us
+        if self._changes:
+            for change in (*self._by_time.due(now_us / 1e6), *self._by_flight.due(flight_time_s)):
+                for direction, impairment in self._base.items():
+                    if change.direction in ("both", direction):
+                        self._base[direction] = change.of(impairment)
+                self._configure()
+
+    def lay_over(self, overlay: Overlay) -> None:
+        """The parameters' settings, for what is sent from now on."""
+        self._overlay = overlay
+        self._configure()
+
+    def _configure(self) -> None:
+        for direction, impairment in self._base.items():
+            self.channel(direction).configure(self._overlay.of(impairment, direction))
+
+    @property
+    def next_due_us(self) -> float:
+        """When the next message arrives, either way; infinite where none is on its way."""
+        return min(self.to_ground.next_due_us, self.to_vehicle.next_due_us)
 
     def statistics(self) -> dict[str, dict[str, float]]:
         """By direction."""
@@ -277,17 +327,32 @@ class Channels:
         }
 
 
-def channels_for(model: LinkModel, seed: int) -> Channels | None:
+class _Timeline:
+    """The changes of one clock. A clock that goes back begins anew: the next flight."""
+
+    def __init__(self, model: LinkModel, clock: str) -> None:
+        self._changes = [change for change in model.changes if change.clock == clock]
+        self._next = 0
+
+    def due(self, time_s: float) -> list[LinkChange]:
+        if time_s < 0.0:
+            self._next = 0
+            return []
+        first = self._next
+        while self._next < len(self._changes) and self._changes[self._next].at_s <= time_s:
+            self._next += 1
+        return self._changes[first : self._next]
+
+
+def channels_for(model: LinkModel, seed: int, place: str = "link") -> Channels | None:
     """Both channels of a scenario's link; None where it is perfect, and nothing is to be between the ends."""
-    if model == LinkModel():
-        return None
-    return Channels(Channel(model.to_ground, seed, "to_ground"), Channel(model.to_vehicle, seed, "to_vehicle"))
+    return None if model == LinkModel() else Channels(model, seed, place)
 
 
 class ImpairedLink:
     """A link of the vehicle's with both channels before it, for real time.
 
-    What is due goes when the driver sends or receives, at least once a tick.
+    What is due goes when the driver sends or receives: it is told by `due_us` when to look.
     """
 
     def __init__(self, link: Link, channels: Channels, now_us: Callable[[], int]) -> None:
@@ -311,6 +376,11 @@ class ImpairedLink:
         for datagram, source in self._link.receive(now_us, limit):
             self.channels.to_vehicle.send(datagram, simulated_us, source)
         return self.channels.to_vehicle.take(simulated_us)
+
+    def due_us(self) -> float:
+        """From now to the next arrival, in simulated microseconds, at least 0; infinite where nothing is on its way."""
+        due_us = self.channels.next_due_us
+        return due_us if due_us == inf else max(0.0, due_us - self._now_us())
 
     def _pass_on(self, now_us: int) -> None:
         for datagram in self.channels.to_ground.due(now_us):

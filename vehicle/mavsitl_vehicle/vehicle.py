@@ -10,6 +10,7 @@ from typing import Any
 from mavsitl.codec import Counters
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector
+from mavsitl.link.settings import LinkName, Overlay
 from mavsitl.log.block import Array
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
@@ -25,6 +26,7 @@ from mavsitl_vehicle.autopilot.seated import SeatedLaw
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint
 from mavsitl_vehicle.autopilot.storage import Store, keep_parameters
 from mavsitl_vehicle.autopilot.wind_estimate import WindEstimate
+from mavsitl_vehicle.links import LinkControl, initial_links
 from mavsitl_vehicle.record import Record
 from mavsitl_vehicle.simulation import Simulation
 
@@ -67,6 +69,7 @@ class Vehicle:
         self._notes: list[str] = []
         """What was wrong with the stored state, for a STATUSTEXT at the first step."""
         self.parameters = Parameters(
+            *(Layer(name, values) for name, values in initial_links(flight.scenario).items()),
             Layer(f"airframe {flight.scenario.airframe}", flight.airframe.parameters),
             Layer(flight.name, flight.scenario.parameters),
             Layer("system id", {"MAV_SYS_ID": system_id}),
@@ -87,6 +90,7 @@ class Vehicle:
         self._shared = Shared(self.parameters, self.plan, card=card, logs=logs, signing=self._signing, trusted=trusted)
         self.simulation = Simulation(flight, self.parameters, seed)
         self.autopilot = self._boot(0)
+        self.links = LinkControl(self.parameters, flight.scenario, lockstep=lockstep)
         self.parameters.subscribe(self._on_parameter)
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
@@ -178,6 +182,13 @@ class Vehicle:
     def counters(self) -> Any:
         """Frames received and refused, by reason, of all links."""
         return sum((port.node.counters for port in self.autopilot.ports), Counters())
+
+    def subscribe_links(self, listener: Callable[[LinkName, Overlay], None]) -> None:
+        """`listener(link, overlay)` is told of what parameters and failures make of a link: now, and at each change.
+
+        The vehicle itself delays and loses nothing.
+        """
+        self.links.subscribe(listener)
 
     def receive(self, port: int, datagram: bytes, at_us: int | None = None) -> int:
         """One datagram from a link; the number of valid frames in it.

@@ -17,6 +17,9 @@ from mavsitl.services.parameter import Refused
 
 INT32_MIN, INT32_MAX = -(2**31), 2**31 - 1
 
+LONGEST_GOOD_MS, LARGEST_KBIT_S = 1e7, 1e6
+"""Of the links' settings, which a scenario does not limit."""
+
 Live: TypeAlias = Literal["now", "arming", "boot"]
 """When a new value counts: from the next tick, from the next arming, from the next start of the vehicle."""
 
@@ -150,6 +153,29 @@ def _mask(
         name, "INT32", default, 0, sum(1 << bit for bit in bits), "", "", text, long, bits=bits, used_by=used_by,
         note=note,
     )  # fmt: skip
+
+
+def _link(prefix: str, whose: str) -> tuple[Parameter, ...]:
+    """The settings of one link; the ends of the names are those of `mavsitl.link.settings`."""
+    rows = (
+        _real(f"{prefix}_LAT", 0, 0, 10_000, "ms", f"Latency of {whose}, each way", decimals=1),
+        _real(f"{prefix}_JIT", 0, 0, 10_000, "ms", f"Jitter of {whose}",
+              "1 sigma, or half the width, by the scenario's distribution.", decimals=1),
+        _real(f"{prefix}_LOSS", 0, 0, 1, "", f"Share of messages lost on {whose}, each for itself", decimals=3),
+        _real(f"{prefix}_BURST", 0, 0, 10_000, "ms", f"Mean length of a burst of losses on {whose}; 0: none",
+              decimals=0),
+        _real(f"{prefix}_GOOD", 2000, 1, LONGEST_GOOD_MS, "ms", f"Mean time between two bursts on {whose}", decimals=0),
+        _real(f"{prefix}_REORD", 0, 0, 1, "", f"Share of messages held back on {whose}",
+              "By the scenario's reorder_ms, 20 ms by default.", decimals=3),
+        _real(f"{prefix}_DUP", 0, 0, 1, "", f"Share of messages that come twice on {whose}", decimals=3),
+        _real(f"{prefix}_CORR", 0, 0, 1, "", f"Share of messages with flipped bits on {whose}", decimals=3),
+        _real(f"{prefix}_BW", 0, 0, LARGEST_KBIT_S, "kbit/s", f"Bandwidth of {whose}; 0: unlimited", decimals=0),
+        _switch(f"{prefix}_DOWN", 0, f"Outage of {whose}",
+                "Who speaks on that link cannot switch it on again: it is done over the other one."),
+        _choice(f"{prefix}_DIR", 0, {0: "Both", 1: "To the ground", 2: "To the vehicle"},
+                f"Direction of {whose} for which the others hold", "The other direction is as in the scenario."),
+    )  # fmt: skip
+    return tuple(row._replace(volatile=True) for row in rows)
 
 
 def _group(group: str, *rows: Parameter) -> tuple[Parameter, ...]:
@@ -475,6 +501,8 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
         _switch("SIM_BAT_ENABLE", 1, "The battery drains", "Off: it stays as it is."),
         _real("SIM_BAT_DRAIN", 0, 0, 86_400, "s", "Time from full to empty in hover; 0: by capacity", decimals=0),
         _real("SIM_BAT_MIN_PCT", 50, 0, 100, "%", "The battery stops draining here", decimals=1),
+        *_link("SIM_LINK", "the off-board link"),
+        *_link("SIM_GLINK", "the ground stations' links"),
     ),
 )
 # fmt: on
@@ -504,6 +532,7 @@ class Parameters:
         self._defaults = {name: TABLE[name].default for name in self.names}
         self._listeners: list[Listener] = []
         self._hash: int | None = None
+        self._locked: dict[str, str] = {}
         for layer in layers:
             source, values = layer if isinstance(layer, Layer) else ("", layer)
             for name, value in values.items():
@@ -542,11 +571,17 @@ class Parameters:
             return Refused(mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST, f"{name[:16]!a}: no such parameter")
         if row.read_only:
             return Refused(mavlink.MAV_PARAM_ERROR_READ_ONLY, f"{name}: is read-only")
+        if name in self._locked:
+            return Refused(mavlink.MAV_PARAM_ERROR_READ_ONLY, f"{name}: {self._locked[name]}")
         problem = row.problem(value)
         if problem is not None:
             return Refused(mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE, f"{name}: {problem}")
         self._store(row, value)
         return None
+
+    def lock(self, names: Iterable[str], reason: str) -> None:
+        """Clients cannot set these in this flight; `reason` is what they are told."""
+        self._locked.update(dict.fromkeys(names, reason))
 
     def put(self, name: str, value: float) -> None:
         """The vehicle's own write, read-only parameters included. Raises ValueError for a value that is not allowed."""

@@ -1,0 +1,125 @@
+"""What is wrong with the vehicle's links on command: parameters and failures in, settings for the channels out.
+
+The vehicle core moves no datagram. Whoever does, subscribes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from typing import TypeAlias
+
+from mavsitl.link.settings import DIRECTION, KEYS, LinkName, Overlay, initial
+from mavsitl.scenario import LinkModel, Scenario, ScenarioError
+from mavsitl_vehicle.autopilot.parameters import TABLE, Parameters
+from mavsitl_vehicle.failures import Kind
+
+Listener: TypeAlias = Callable[[LinkName, Overlay], None]
+
+NAMES: Mapping[LinkName, Mapping[str, str]] = {
+    "link": {key: f"SIM_LINK_{key}" for key in (*KEYS, DIRECTION)},
+    "gcs_link": {key: f"SIM_GLINK_{key}" for key in (*KEYS, DIRECTION)},
+}
+"""The parameter of each setting."""
+
+INSTANCES: Mapping[int, LinkName] = {1: "link", 2: "gcs_link"}
+"""Of the failure unit MAVLINK."""
+
+FAILURES: Mapping[Kind, tuple[Mapping[str, float], str]] = {
+    Kind.OFF: ({"DOWN": 1.0}, "nothing comes through"),
+    Kind.GARBAGE: ({"CORR": 0.2}, "a fifth of the messages have flipped bits"),
+    Kind.SLOW: ({"BW": 57.6}, "57.6 kbit/s, a telemetry radio's; what does not fit is lost"),
+    Kind.DELAYED: ({"LAT": 500.0}, "500 ms later, each way"),
+    Kind.INTERMITTENT: ({"BURST": 500.0, "GOOD": 2000.0}, "bursts of 500 ms, every 2.5 s on average"),
+}
+"""Settings of a link that has this failure, over the parameters', both ways; and what they mean."""
+
+PERFECT = (
+    "the lock-step exchange of this flight has a perfect link; give the scenario a [link], or link.live = true, "
+    "or link.changes"
+)
+NO_GCS = "there is no ground-station link in lock-step"
+
+
+def initial_links(scenario: Scenario) -> dict[LinkName, dict[str, float]]:
+    """What the parameters of each link begin with, by the scenario's section; within the parameters' limits."""
+    models: dict[LinkName, LinkModel] = {"link": scenario.link, "gcs_link": scenario.gcs_link}
+    return {link: dict(_parameters(link, model)) for link, model in models.items()}
+
+
+def _parameters(link: LinkName, model: LinkModel) -> Iterator[tuple[str, float]]:
+    for key, value in initial(model).items():
+        row = TABLE[NAMES[link][key]]
+        yield row.name, min(max(value, row.minimum), row.maximum)
+
+
+class LinkControl:
+    """The links' parameters and failures as overlays over the scenario's links."""
+
+    def __init__(self, parameters: Parameters, scenario: Scenario, *, lockstep: bool) -> None:
+        """In `lockstep` the parameters of links that cannot change are locked.
+
+        Raises `ScenarioError` where the scenario itself sets one of those of the off-board link.
+        """
+        self._parameters = parameters
+        self._initial = initial_links(scenario)
+        self._failures: dict[LinkName, Kind] = {}
+        self._listeners: list[Listener] = []
+        self._told: dict[LinkName, Overlay] = {}
+        self._refusals: dict[LinkName, str] = {}
+        if lockstep:
+            self._refusals["gcs_link"] = NO_GCS
+            if scenario.link == LinkModel():
+                self._refusals["link"] = PERFECT
+                for name in self.overlay("link").values:
+                    raise ScenarioError(f"parameters.{NAMES['link'][name]}: {PERFECT}")
+        for link, reason in self._refusals.items():
+            parameters.lock(self._initial[link], reason)
+        parameters.subscribe(self._on_parameter)
+
+    def refusal(self, link: LinkName) -> str | None:
+        """Why nothing can be changed on this link in this flight; None where it can."""
+        return self._refusals.get(link)
+
+    def overlay(self, link: LinkName) -> Overlay:
+        """The parameters that are not as in the scenario, and the failure's settings over them."""
+        names, begun = NAMES[link], self._initial[link]
+        now = {key: self._parameters[names[key]] for key in KEYS}
+        values = {key: value for key, value in now.items() if _single(value) != _single(begun[names[key]])}
+        failure, _ = FAILURES.get(self._failures.get(link, Kind.OK), ({}, ""))
+        return Overlay(values, int(self._parameters[names[DIRECTION]]), failure)
+
+    def fail(self, instance: int, kind: Kind) -> str | None:
+        """Instance 1 (off-board) or 2 (ground stations) of the unit MAVLINK; None where it is done, else why not."""
+        link = INSTANCES[instance]
+        if kind is not Kind.OK and kind not in FAILURES:
+            return f"a link cannot be {kind.name.lower()}"
+        if kind is not Kind.OK and link in self._refusals:
+            return self._refusals[link]
+        self._failures[link] = kind
+        self._tell(link)
+        return None
+
+    def subscribe(self, listener: Listener) -> None:
+        """Hear of every link now, and then of each that changes."""
+        self._listeners.append(listener)
+        for link in NAMES:
+            listener(link, self.overlay(link))
+
+    def _on_parameter(self, name: str, value: float) -> None:
+        for link, names in self._initial.items():
+            if name in names:
+                self._tell(link)
+
+    def _tell(self, link: LinkName) -> None:
+        overlay = self.overlay(link)
+        if self._told.get(link) == overlay:
+            return
+        self._told[link] = overlay
+        for listener in self._listeners:
+            listener(link, overlay)
+
+
+def _single(value: float) -> bytes:
+    """A parameter is what the wire carries."""
+    return struct.pack("<f", value)
