@@ -592,7 +592,7 @@ class _Status:
                 "event": "end", "simulated_s": outcome.simulated_s, "wall_s": outcome.wall_s, "speed": outcome.speed,
                 "wire_hash": outcome.wire_hash, "finished": outcome.finished,
                 "frames": outcome.frames, "rejected": outcome.rejected,
-                **({} if outcome.link is None else {"link": outcome.link}),
+                "dropped": outcome.dropped, **outcome.links,
             })  # fmt: skip
             return
         print(
@@ -601,8 +601,11 @@ class _Status:
         )
         if outcome.rejected:
             print(f"{outcome.rejected} bad frames were dropped")
-        for direction, counts in (outcome.link or {}).items():
-            print(f"link {direction}: " + ", ".join(f"{name} {value:g}" for name, value in counts.items() if value))
+            print("  by reason: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
+        for place, directions in outcome.links.items():
+            for direction, counts in directions.items():
+                shown = ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
+                print(f"{place} {direction}: {shown}")
         if outcome.lateness_us is not None:
             p50, p99 = outcome.lateness_us
             print(f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; schedule moved {outcome.rebased} times")

@@ -64,6 +64,21 @@ class LatenessHistogram:
                 return min(self._upper_edge_ns(index) / 1000, self.max_us)
         raise AssertionError("the bins hold every lateness that was counted")
 
+    def copy(self) -> LatenessHistogram:
+        """As it is now."""
+        made = LatenessHistogram()
+        made.count, made.max_us, made._bins = self.count, self.max_us, list(self._bins)
+        return made
+
+    def since(self, earlier: LatenessHistogram) -> LatenessHistogram:
+        """What was counted after `earlier`, a copy of this one; its maximum is read off the bins, too."""
+        made = LatenessHistogram()
+        made.count = self.count - earlier.count
+        made._bins = [now - before for now, before in zip(self._bins, earlier._bins, strict=True)]
+        filled = [index for index, number in enumerate(made._bins) if number]
+        made.max_us = min(self._upper_edge_ns(filled[-1]) / 1000, self.max_us) if filled else 0.0
+        return made
+
     @property
     def p50_us(self) -> float:
         """Median lateness, microseconds."""

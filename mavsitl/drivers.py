@@ -98,6 +98,8 @@ class Tap:
 
     wire: WireHash = field(default_factory=WireHash)
     tlog: TlogWriter | None = None
+    record: Callable[[int], None] | None = None
+    """Told the time once a second, before the flush: for what is logged at that rate."""
     flush: Callable[[int], None] | None = None
     started_us: int | None = None
     """Wall clock at the first datagram of the ground: what came before is start-up, not flying."""
@@ -115,6 +117,8 @@ class Tap:
     def tick(self, now_us: int) -> None:
         if now_us - self._flushed_us >= FLUSH_INTERVAL_US:
             self._flushed_us = now_us
+            if self.record is not None:
+                self.record(now_us)
             if self.flush is not None:
                 self.flush(now_us)
             if self.tlog is not None:

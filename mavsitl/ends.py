@@ -6,7 +6,7 @@ import errno
 import ipaddress
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,6 +18,7 @@ from mavsitl.herald import Herald
 from mavsitl.link.address import Address
 from mavsitl.link.base import Link, LinkError
 from mavsitl.link.endpoint import open_link
+from mavsitl.link.settings import PLACES
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
 from mavsitl.log.errors import LogError
 from mavsitl.log.tlog import TlogWriter
@@ -26,6 +27,7 @@ from mavsitl.scenario import Flight, LinkModel
 if TYPE_CHECKING:
     from mavsitl.check import Ear, Report, VehiclePort
     from mavsitl.link.impaired import Channels, ImpairedLink
+    from mavsitl.link.settings import LinkName, Overlay
     from mavsitl.log.ulog import Recorder
 
 WIRE_LOG = "link.tlog"
@@ -52,8 +54,11 @@ class Outcome:
     lateness_us: tuple[float, float] | None = None
     """p50 and p99 of the tick's lateness; real time only."""
     rebased: int = 0
-    link: dict[str, dict[str, float]] | None = None
-    """Of an impaired link, by direction: `mavsitl.link.impaired.Statistics`; None of a perfect one, and the ground."""
+    links: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
+    """Of the vehicle's impaired links ("link", "gcs_link", "tcp_link"), by direction:
+    `mavsitl.link.impaired.Statistics`."""
+    dropped: dict[str, int] = field(default_factory=dict)
+    """Input that was not taken, by reason, those that happened: `mavsitl.codec.Counters`."""
 
     @property
     def speed(self) -> float:
@@ -68,11 +73,83 @@ IMPAIRED_GRACE_S = 300.0
 
 
 def _channels(flight: Flight) -> Channels | None:
+    """Of the off-board link in lock-step; a perfect one has none."""
     if flight.scenario.link == LinkModel():
         return None
     from mavsitl.link.impaired import channels_for  # here, for it loads numpy
 
     return channels_for(flight.scenario.link, flight.scenario.seed)
+
+
+def _watch_lockstep_link(core: Any, channels: Channels | None, recorder: Recorder, tap: Tap) -> None:
+    """Parameters change the one link, and it is logged."""
+    if channels is None:
+        return
+    from mavsitl.log.links import LinkLog
+
+    def listen(link: LinkName, overlay: Overlay) -> None:
+        if link == "link":
+            channels.lay_over(overlay)
+
+    _subscribe(core, listen)
+    tap.record = LinkLog(recorder, lambda: {"link": channels}).write
+
+
+def _subscribe(core: Any, listener: Callable[[LinkName, Overlay], None]) -> None:
+    """To a vehicle that has settings of its links in flight; another wing's need not."""
+    subscribe = getattr(core, "subscribe_links", None)
+    if subscribe is not None:
+        subscribe(listener)
+
+
+class _LiveLinks:
+    """The vehicle's links in real time. One that is perfect has nothing before it until a parameter makes it bad."""
+
+    def __init__(self, links: list[Link], flight: Flight, speed: float) -> None:
+        """`links` in the order of the ports; elements of the list are replaced."""
+        self.channels: dict[str, Channels] = {}
+        """By place; those that there are."""
+        self.flight_time_s: Callable[[], float] = lambda: -1.0
+        self._links = links
+        self._impaired: list[ImpairedLink] = []
+        self._seed = flight.scenario.seed
+        self._speed = speed
+        self._start_us = monotonic_us()
+        scenario = flight.scenario
+        self._models = {place: scenario.link if place == "link" else scenario.gcs_link for place in PLACES}
+        for place, _ in zip(PLACES, links, strict=False):
+            if self._models[place] != LinkModel():
+                self._impair(place)
+
+    def listen(self, link: LinkName, overlay: Overlay) -> None:
+        """What parameters and failures make of a link."""
+        for place, _ in zip(PLACES, self._links, strict=False):
+            if (place == "link") == (link == "link"):
+                if place not in self.channels:
+                    if overlay.leaves(self._models[place]):
+                        continue
+                    self._impair(place)
+                self.channels[place].lay_over(overlay)
+
+    def due_s(self) -> float:
+        """Wall time to the next arrival on any of them."""
+        return min((link.due_us() for link in self._impaired), default=inf) * 1e-6 / self._speed
+
+    def statistics(self) -> dict[str, dict[str, dict[str, float]]]:
+        return {place: channels.statistics() for place, channels in self.channels.items()}
+
+    def _now_us(self) -> int:
+        """Wall time times speed, since the start."""
+        return int((monotonic_us() - self._start_us) * self._speed)
+
+    def _impair(self, place: str) -> None:
+        from mavsitl.link.impaired import Channels, ImpairedLink  # here, for it loads numpy
+
+        index = PLACES.index(place)
+        channels = self.channels[place] = Channels(self._models[place], self._seed, place)
+        link = ImpairedLink(self._links[index], channels, self._now_us, lambda: self.flight_time_s())
+        self._links[index] = link
+        self._impaired.append(link)
 
 
 @contextmanager
@@ -162,11 +239,12 @@ def vehicle_lockstep(
             )
             watch = _Watch(core)
             channels = _channels(flight)
+            _watch_lockstep_link(core, channels, recorder, tap)
             end_us = drivers.run_lockstep_vehicle(
                 core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
                 channels=channels, max_time_s=flight.scenario.duration_s + IMPAIRED_GRACE_S,
             )  # fmt: skip
-            return watch.outcome(end_us, tap, channels=channels)
+            return watch.outcome(end_us, tap, links=_statistics(channels))
     finally:
         link.close()
 
@@ -217,10 +295,6 @@ def vehicle_realtime(
                 host_option="--bind HOST",
             )
         )
-        channels = _channels(flight)
-        impaired = None if channels is None else _impaired(opened[0], channels, speed)
-        if impaired is not None:
-            opened[0] = impaired
         opened.append(
             UdpLink(
                 (links.bind, links.gcs_port), links.gcs_remote, port_option="--gcs-port N", host_option="--bind HOST"
@@ -230,6 +304,7 @@ def vehicle_realtime(
             from mavsitl.link.tcp import TcpServerLink
 
             opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
+        live = _LiveLinks(opened, flight, speed)
         with ExitStack() as stack:
             with Herald(wings.find_boot(wing), system_id, opened) as herald:
                 recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight))
@@ -239,30 +314,31 @@ def vehicle_realtime(
                     ports=("offboard", *["gcs"] * (len(opened) - 1)), lockstep=False,
                     state=state, logs=folder, unix_us=_steady_unix_clock(), trusted=is_loopback(links.bind),
                 )  # fmt: skip
-            if impaired is not None:
-                impaired.flight_time_s = lambda: core.flight_time_s
+            live.flight_time_s = lambda: core.flight_time_s
+            _subscribe(core, live.listen)
+            if folder is not None:
+                from mavsitl.log.links import LinkLog
+
+                tap.record = LinkLog(recorder, lambda: live.channels).write
             if herald.sequence:
                 core.continue_from(herald.sequence)
             watch = _Watch(core)
             try:
                 timing = drivers.run_realtime_vehicle(
-                    core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, progress=progress
-                )
+                    core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, progress=progress,
+                    due_s=live.due_s,
+                )  # fmt: skip
             finally:
                 core.close()
             lateness = (timing.lateness.p50_us, timing.lateness.p99_us)
-            return watch.outcome(timing.simulated_us, tap, lateness, timing.rebased, timing.wall_us, channels)
+            return watch.outcome(timing.simulated_us, tap, lateness, timing.rebased, timing.wall_us, live.statistics())
     finally:
         for link in opened:
             link.close()
 
 
-def _impaired(link: Link, channels: Channels, speed: float) -> ImpairedLink:
-    """In wall time times speed, which begins now."""
-    from mavsitl.link.impaired import ImpairedLink
-
-    start_us = monotonic_us()
-    return ImpairedLink(link, channels, lambda: int((monotonic_us() - start_us) * speed))
+def _statistics(channels: Channels | None) -> dict[str, dict[str, dict[str, float]]]:
+    return {} if channels is None else {"link": channels.statistics()}
 
 
 def ground_realtime(
@@ -303,9 +379,10 @@ def in_memory(
         ground = wings.find(wings.GROUND_GROUP)(flight, ground_recorder, report=report)
         watch = _Watch(ground)
         channels = _channels(flight)
+        _watch_lockstep_link(vehicle, channels, vehicle_recorder, tap)
         limit_s = inf if channels is None else flight.scenario.duration_s + IMPAIRED_GRACE_S
         end_us = drivers.fly_in_memory(vehicle, ground, tap, max_time_s=limit_s, progress=progress, channels=channels)
-        return watch.outcome(end_us, tap, channels=channels)
+        return watch.outcome(end_us, tap, links=_statistics(channels), heard_by=vehicle)
 
 
 def is_loopback(host: str) -> bool:
@@ -410,10 +487,14 @@ class _Watch:
         lateness_us: tuple[float, float] | None = None,
         rebased: int = 0,
         wall_us: int | None = None,
-        channels: Channels | None = None,
+        links: dict[str, dict[str, dict[str, float]]] | None = None,
+        heard_by: Any = None,
     ) -> Outcome:
-        """`wall_us`: None is since the first exchange."""
+        """`wall_us`: None is since the first exchange. `heard_by`: the core whose dropped input counts; None: this."""
         counters = self._core.counters
+        dropped = asdict((heard_by or self._core).counters)
+        if tap.record is not None:
+            tap.record(simulated_us)
         if wall_us is None:
             wall_us = monotonic_us() - (tap.started_us or self._start_us)
         return Outcome(
@@ -425,5 +506,6 @@ class _Watch:
             rejected=counters.rejected,
             lateness_us=lateness_us,
             rebased=rebased,
-            link=None if channels is None else channels.statistics(),
+            links=links or {},
+            dropped={name: count for name, count in dropped.items() if count and name != "frames"},
         )

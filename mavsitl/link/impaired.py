@@ -20,13 +20,10 @@ from mavsitl.link.framing import split_frames
 from mavsitl.link.settings import AS_IN_SCENARIO, DirectionName, Overlay
 from mavsitl.scenario import Impairment, LinkChange, LinkModel
 
-__all__ = ["MAX_IN_FLIGHT", "PLACES", "Channel", "Channels", "ImpairedLink", "Statistics", "channels_for"]
+__all__ = ["MAX_IN_FLIGHT", "Channel", "Channels", "ImpairedLink", "Statistics", "channels_for"]
 
 MAX_IN_FLIGHT = 20_000
 """Messages on their way in one direction, at most; further ones are lost and counted as queue drops."""
-
-PLACES = ("link", "gcs_link", "tcp_link")
-"""Links by the names of their random numbers: off-board, ground stations over UDP and over TCP."""
 
 _BLOCK = 512
 _FOR_EVER_US = 1 << 62
@@ -105,7 +102,7 @@ class Channel:
     """
 
     def __init__(self, impairment: Impairment, seed: int, direction: DirectionName, place: str = "link") -> None:
-        """`place`: one of `PLACES`; each has random numbers of its own."""
+        """`place`: one of `settings.PLACES`; each has random numbers of its own."""
         self.statistics = Statistics()
         self.flight_began_us: int | None = None
         # A stream for each effect, so that switching one on leaves the others' draws as they are.
@@ -279,7 +276,7 @@ class Channels:
     """
 
     def __init__(self, model: LinkModel, seed: int, place: str = "link") -> None:
-        """`place`: one of `PLACES`."""
+        """`place`: one of `settings.PLACES`."""
         self.to_ground = Channel(model.to_ground, seed, "to_ground", place)
         self.to_vehicle = Channel(model.to_vehicle, seed, "to_vehicle", place)
         self._base: dict[DirectionName, Impairment] = {"to_ground": model.to_ground, "to_vehicle": model.to_vehicle}
@@ -355,12 +352,18 @@ class ImpairedLink:
     What is due goes when the driver sends or receives: it is told by `due_us` when to look.
     """
 
-    def __init__(self, link: Link, channels: Channels, now_us: Callable[[], int]) -> None:
-        """`now_us`: simulated time by the wall clock."""
+    def __init__(
+        self,
+        link: Link,
+        channels: Channels,
+        now_us: Callable[[], int],
+        flight_time_s: Callable[[], float] = lambda: -1.0,
+    ) -> None:
+        """`now_us`: simulated time by the wall clock; `flight_time_s`: negative before the release."""
         self._link = link
         self.channels = channels
         self._now_us = now_us
-        self.flight_time_s: Callable[[], float] = lambda: -1.0
+        self.flight_time_s = flight_time_s
 
     def send(self, datagram: bytes) -> None:
         now_us = self._now_us()

@@ -12,10 +12,14 @@ import msgspec
 
 from mavsitl.scenario import Impairment, LinkModel
 
-__all__ = ["AS_IN_SCENARIO", "BOTH", "DIRECTION", "KEYS", "DirectionName", "LinkName", "Overlay", "initial"]
+__all__ = ["AS_IN_SCENARIO", "BOTH", "DIRECTION", "KEYS", "PLACES", "DirectionName", "LinkName", "Overlay", "initial"]
 
 LinkName: TypeAlias = Literal["link", "gcs_link"]
 """As the scenario's sections are called: the off-board link, and the ground stations'."""
+
+PLACES = ("link", "gcs_link", "tcp_link")
+"""A vehicle's ports in order: off-board, ground stations over UDP, over TCP. The last two are both "gcs_link"; each
+place has random numbers of its own."""
 
 DirectionName: TypeAlias = Literal["to_ground", "to_vehicle"]
 
@@ -68,6 +72,11 @@ class Overlay(NamedTuple):
             else:
                 plain[key] = bool(value) if key == "down" else value
         return msgspec.structs.replace(impairment, bursts=bursts, **plain)
+
+    def leaves(self, model: LinkModel) -> bool:
+        """Whether it changes nothing of that link."""
+        to_ground, to_vehicle = model.to_ground, model.to_vehicle
+        return self.of(to_ground, "to_ground") == to_ground and self.of(to_vehicle, "to_vehicle") == to_vehicle
 
 
 AS_IN_SCENARIO = Overlay({})

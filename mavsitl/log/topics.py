@@ -34,11 +34,19 @@ DATA_MESSAGE = ord("D")
 class Topic:
     """One ULog topic. `fields` are ULog declarations, e.g. ``"float[4] q"``; ``uint64_t timestamp`` (us) leads.
 
+    Topics of one name with the same fields are told apart by their `instance`, ULog's multi id.
+
     Raises ValueError for a declaration that is not one of the types above.
     """
 
     name: str
     fields: tuple[str, ...]
+    instance: int = 0
+
+    @property
+    def key(self) -> str:
+        """Its name in tables of topics: ``name``, ``name.1``, ..."""
+        return f"{self.name}.{self.instance}" if self.instance else self.name
 
     def __post_init__(self) -> None:
         for field in self.fields:
@@ -119,6 +127,35 @@ VEHICLE_STATUS = Topic("vehicle_status", ("uint8_t arming_state", "uint8_t nav_s
 LAND_DETECTED = Topic("vehicle_land_detected", ("uint8_t landed", "uint8_t ground_contact"))
 """Written at every change; the first row with landed = 0 is the release."""
 
+TELEMETRY_STATUS = tuple(
+    Topic(
+        "telemetry_status",
+        (
+            "uint32_t rx_message_count", "uint32_t rx_message_lost_count", "uint32_t rx_parse_errors",
+            "uint32_t rx_packet_drop_count", "uint32_t bad_crc", "uint32_t bad_length", "uint32_t unknown_id",
+            "uint32_t incompatible", "uint32_t unsupported",
+        ),
+        instance,
+    )
+    for instance in range(3)
+)  # fmt: skip
+"""The vehicle's ports in order (off-board, ground stations over UDP, over TCP), once a second. Counts since the start:
+good frames; those missing by their sequence numbers; what looked like a frame and was none, which the last but one are
+the kinds of; datagrams of which a part or all was not looked at; good frames that nobody here handles. The first four
+have PX4's names."""
+
+_CHANNEL = (
+    "uint32_t sent", "uint32_t delivered", "uint32_t lost", "uint32_t outage", "uint32_t queue_drops",
+    "uint32_t corrupted", "uint32_t duplicated", "uint32_t reordered", "uint32_t late",
+    "float delay_p50_ms", "float delay_p99_ms", "float delay_max_ms",
+)  # fmt: skip
+CHANNELS = {
+    place: {direction: Topic(f"{place}_{direction}", _CHANNEL) for direction in ("to_ground", "to_vehicle")}
+    for place in ("link", "gcs_link", "tcp_link")
+}
+"""An impaired link's directions, once a second: counts of messages since the start, as in
+`mavsitl.link.impaired.Statistics`, and the delays of those that came in that second."""
+
 # Whichever end the nets are seated in
 PIDNN_WEIGHTS = Topic("pidnn_weights", ("float[3] roll", "float[3] pitch", "float[3] yaw"))
 """Output weights P, I, D."""
@@ -148,6 +185,8 @@ VEHICLE_TOPICS = (
     VEHICLE_STATUS,
     LAND_DETECTED,
     PIDNN_WEIGHTS,
+    *TELEMETRY_STATUS,
+    *(topic for directions in CHANNELS.values() for topic in directions.values()),
 )
 GROUND_TOPICS = (TRAJECTORY_SETPOINT, ATTITUDE_SETPOINT, CONTROL_DEMAND, PIDNN_WEIGHTS, LINK_STATUS)
 TOPICS = tuple(dict.fromkeys(VEHICLE_TOPICS + GROUND_TOPICS))

@@ -108,10 +108,10 @@ class MemoryRecorder:
         """(timestamp us, level, text)"""
 
     def topic(self, topic: Topic) -> Rows:
-        known = self._rows.get(topic.name)
+        known = self._rows.get(topic.key)
         if known is None:
             sink = _Sink(4096 * topic.message.size)
-            known = self._rows[topic.name] = (Rows(topic, len(self._rows), sink), sink)
+            known = self._rows[topic.key] = (Rows(topic, len(self._rows), sink), sink)
         elif known[0].topic != topic:
             raise ValueError(f"{topic.name}: recorded already with other fields")
         return known[0]
@@ -126,7 +126,7 @@ class MemoryRecorder:
         """A copy of the columns, scalars (k,), arrays (k, length), in the log's own types; k = 0 if never written."""
         for drain in self._drains:
             drain()
-        rows, sink = self._rows.get(topic.name, (None, _Sink(0)))
+        rows, sink = self._rows.get(topic.key, (None, _Sink(0)))
         if rows is not None and rows.topic != topic:
             raise ValueError(f"{topic.name}: recorded with other fields")
         return topic.arrays(sink.buffer, sink.offset // topic.message.size)
@@ -211,7 +211,7 @@ class UlogWriter:
         self._flushed_us = start_us
         self._drains: list[Callable[[], None]] = []
         parts = [MAGIC + struct.pack("<Q", start_us), _message("B", bytes(40))]
-        parts += [_message("F", topic.ulog_format.encode("ascii")) for topic in asked]
+        parts += [_message("F", text.encode("ascii")) for text in dict.fromkeys(topic.ulog_format for topic in asked)]
         for key, text in info.items():
             value = text.encode("utf-8")
             parts.append(_message("I", _keyed(f"char[{len(value)}] {key}", value)))
@@ -221,14 +221,14 @@ class UlogWriter:
             else:
                 parts.append(_message("P", _keyed(f"float {key}", struct.pack("<f", number))))
         for message_id, topic in enumerate(asked):
-            parts.append(_message("A", struct.pack("<BH", 0, message_id) + topic.name.encode("ascii")))
+            parts.append(_message("A", struct.pack("<BH", topic.instance, message_id) + topic.name.encode("ascii")))
         self._sink = _FileSink(path, _BUFFER_BYTES)
-        self._rows = {topic.name: Rows(topic, message_id, self._sink) for message_id, topic in enumerate(asked)}
+        self._rows = {topic.key: Rows(topic, message_id, self._sink) for message_id, topic in enumerate(asked)}
         self._sink.write(b"".join(parts))
         self._sink.drain()
 
     def topic(self, topic: Topic) -> Rows:
-        rows = self._rows.get(topic.name)
+        rows = self._rows.get(topic.key)
         if rows is None or rows.topic != topic:
             raise ValueError(f"{topic.name}: not among the topics that this file was opened with")
         return rows
@@ -267,7 +267,7 @@ class UlogWriter:
 
 
 def read(path: Path) -> dict[str, dict[str, npt.NDArray[Any]]]:
-    """Topic name -> column -> values: scalars (k,), array fields (k, length), as in `MemoryRecorder.tables`.
+    """Topic key -> column -> values: scalars (k,), array fields (k, length), as in `MemoryRecorder.tables`.
 
     Topics without rows are left out. A file that was cut off is read up to the cut. Raises `LogError`.
     """
@@ -282,7 +282,7 @@ def read(path: Path) -> dict[str, dict[str, npt.NDArray[Any]]]:
         raise LogError(f"{path}: not a ULog file: {error}") from error
     if log.file_corruption:
         raise LogError(f"{path}: damaged: a message in it is not valid ULog")
-    return {dataset.name: _columns(dataset.data) for dataset in log.data_list}
+    return {Topic(dataset.name, (), dataset.multi_id).key: _columns(dataset.data) for dataset in log.data_list}
 
 
 def _columns(flat: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:

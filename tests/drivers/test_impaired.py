@@ -59,7 +59,7 @@ def test_two_processes_over_a_bad_link_put_the_same_bytes_on_the_wire(tmp_path: 
     assert result.vehicle["wire_hash"] == result.ground["wire_hash"] == in_memory
     statistics = result.vehicle["link"]
     same = ends.in_memory(flight, None, report=lambda text: None, progress=None)
-    assert statistics == same.link
+    assert {"link": statistics} == same.links
     for way in ("to_ground", "to_vehicle"):
         counts = statistics[way]
         assert counts["sent"] > 500

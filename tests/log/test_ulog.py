@@ -26,7 +26,7 @@ def fill(recorder: Recorder, rows: int) -> None:
 
 
 def test_topics_are_named_once_and_pack_without_padding() -> None:
-    assert len({topic.name for topic in TOPICS}) == len(TOPICS)
+    assert len({topic.key for topic in TOPICS}) == len(TOPICS)
     for topic in TOPICS:
         assert topic.dtype.itemsize == topic.message.size
         assert topic.columns[0] == ("timestamp", "uint64_t", None)

@@ -30,6 +30,9 @@ _INNER = slice(33, 37)
 _THRUST = 37
 _WIDTH = 38
 
+PORTS_US = 1_000_000
+"""Between two rows of the ports' counters."""
+
 
 class Record:
     """The vehicle's log: truth beside estimate every tick, states when they change."""
@@ -56,6 +59,8 @@ class Record:
         self._weights = recorder.topic(topics.PIDNN_WEIGHTS) if aboard else None
         self._status = recorder.topic(topics.VEHICLE_STATUS)
         self._land = recorder.topic(topics.LAND_DETECTED)
+        self._recorder = recorder
+        self._ports_due_us = 0
         self._last_status: tuple[bool, Mode, bool] | None = None
         self._last_land: int | None = None
 
@@ -69,6 +74,9 @@ class Record:
         row[_THRUST] = simulation.demand[tick.THRUST, 0]
         if self._weights is not None and vehicle.weights is not None:
             self._weights.append(now_us, *vehicle.weights[:, :, 0].T.ravel().tolist())
+        if now_us >= self._ports_due_us:
+            self._ports_due_us = now_us + PORTS_US
+            self._write_ports(now_us, vehicle)
         commander = autopilot.commander
         status = (commander.armed, commander.mode, commander.failsafe)
         if status != self._last_status:
@@ -79,6 +87,16 @@ class Record:
         if landed != self._last_land:
             self._last_land = landed
             self._land.append(now_us, landed, landed)
+
+    def _write_ports(self, now_us: int, vehicle: Vehicle) -> None:
+        for topic, port in zip(topics.TELEMETRY_STATUS, vehicle.autopilot.ports, strict=False):
+            node, counted = port.node, port.node.counters
+            lost = sum(source.lost for source in node.sources.values())
+            dropped = counted.oversize + counted.abandoned
+            self._recorder.topic(topic).append(
+                now_us, counted.frames, lost, counted.rejected, dropped,
+                counted.bad_crc, counted.bad_length, counted.unknown_id, counted.incompatible, counted.unsupported,
+            )  # fmt: skip
 
 
 def _thrust_frd(thrust: Array) -> Array:
