@@ -25,6 +25,7 @@ from mavsitl.link.udp import ConnectedUdp
 from mavsitl.log.tlog import Direction, TlogWriter, WireHash
 
 if TYPE_CHECKING:
+    from mavsitl.ask import Ask
     from mavsitl.check import Check
     from mavsitl.link.impaired import Channels
 
@@ -595,3 +596,18 @@ def run_check(check: Check, links: Sequence[Link | None], duration_s: float) -> 
                     link.send(datagram)
             now_us = monotonic_us()
     return now_us - start_us
+
+
+def run_ask(ask: Ask, link: Link) -> None:
+    """On the wall clock until it is done."""
+    start_us = monotonic_us()
+    while not ask.done:
+        now_us = monotonic_us()
+        ask.step(now_us - start_us)
+        for datagram in ask.datagrams():
+            link.send(datagram)
+        if not link.wait(CHECK_WAIT_S):
+            continue
+        for datagram, source in link.receive(now_us):
+            if ask.receive(datagram, now_us - start_us):
+                link.admit(source, now_us)

@@ -25,6 +25,7 @@ from mavsitl.log.tlog import TlogWriter
 from mavsitl.scenario import Flight, LinkModel
 
 if TYPE_CHECKING:
+    from mavsitl.ask import Reply, Task
     from mavsitl.check import Ear, Report, VehiclePort
     from mavsitl.link.impaired import Channels, ImpairedLink
     from mavsitl.link.settings import LinkName, Overlay
@@ -432,6 +433,19 @@ def check(endpoints: Sequence[Address] | None, *, duration_s: float, ask: bool) 
         for opened in links:
             if opened is not None:
                 opened.close()
+
+
+def ask(task: Task, address: Address, *, system_id: int | None, patience_s: float) -> Reply:
+    """Ask the vehicle that is heard at an endpoint. Raises `LinkError` for an endpoint that cannot be opened."""
+    from mavsitl.ask import Ask
+
+    asking = Ask(task, system_id=system_id, patience_us=round(patience_s * 1e6))
+    link = open_link(address, port_option="--endpoint ENDPOINT", host_option="--endpoint ENDPOINT")
+    try:
+        drivers.run_ask(asking, link)
+    finally:
+        link.close()
+    return asking.reply()
 
 
 def _default_endpoints() -> list[Address]:

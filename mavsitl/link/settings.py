@@ -12,10 +12,24 @@ import msgspec
 
 from mavsitl.scenario import Impairment, LinkModel
 
-__all__ = ["AS_IN_SCENARIO", "BOTH", "DIRECTION", "KEYS", "PLACES", "DirectionName", "LinkName", "Overlay", "initial"]
+__all__ = [
+    "AS_IN_SCENARIO",
+    "BOTH",
+    "DIRECTION",
+    "KEYS",
+    "PLACES",
+    "PREFIXES",
+    "DirectionName",
+    "LinkName",
+    "Overlay",
+    "initial",
+]
 
 LinkName: TypeAlias = Literal["link", "gcs_link"]
 """As the scenario's sections are called: the off-board link, and the ground stations'."""
+
+PREFIXES: Mapping[LinkName, str] = {"link": "SIM_LINK_", "gcs_link": "SIM_GLINK_"}
+"""Of the parameters' names."""
 
 PLACES = ("link", "gcs_link", "tcp_link")
 """A vehicle's ports in order: off-board, ground stations over UDP, over TCP. The last two are both "gcs_link"; each

@@ -63,6 +63,8 @@ class Outcome(msgspec.Struct, frozen=True):
     """Largest absolute errors, of a lost flight up to its loss."""
     weight_range: tuple[float, float] = (1.0, 1.0)
     message: str = ""
+    left_offboard: int = 0
+    """Times that the vehicle was in another mode than OFFBOARD during the flight."""
 
     @property
     def flown(self) -> bool:
@@ -159,8 +161,9 @@ def fly(job: Job) -> Outcome:
         time_s = sums.time_s if sums.lost_s is None else sums.lost_s
         rmse = sums.rmse if status == "flown" else None
         return Outcome(
-            job.key, job.flight.name, job.seed, status, time_s, rmse, sums.largest, sums.weight_range, message
-        )
+            job.key, job.flight.name, job.seed, status, time_s, rmse, sums.largest, sums.weight_range, message,
+            sums.left_offboard,
+        )  # fmt: skip
 
     said: list[str] = []
     try:

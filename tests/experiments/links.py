@@ -44,6 +44,33 @@ LINKS: dict[str, Overrides] = {
     "bursts of 200 ms": both(bursts__bad_ms=200.0),
     "1 % reorder": both(reorder=0.01),
 }
+SLOW_GAINS: Overrides = {
+    **LEVELS["attitude/stock"],
+    "controller.position.k_p_per_s2": 1.7,
+    "controller.position.k_i_per_s3": 0.2,
+    "controller.position.k_d_per_s": 1.8,
+    "controller.altitude.k_p_per_s2": 2.0,
+    "controller.altitude.k_i_per_s3": 0.4,
+    "controller.altitude.k_d_per_s": 2.5,
+    "controller.wind_observer.horizontal_rad_s": 0.5,
+    "controller.wind_observer.vertical_rad_s": 0.5,
+}
+"""A position loop that bears a round trip of 0.2 s: about PX4's own MPC_XY_P and MPC_XY_VEL_P_ACC."""
+
+WORSE_LEVELS: dict[str, Overrides] = {**LEVELS, "attitude/stock, slow gains": SLOW_GAINS}
+WORSE: dict[str, Overrides] = {
+    "30 % loss": both(loss=0.3),
+    "bursts of 200 ms": both(bursts__bad_ms=200.0),
+    "50 to 130 ms": both(latency_ms=90.0, jitter_ms=40.0, distribution="uniform"),
+    "20 % reorder": both(reorder=0.2),
+    "10 % duplicates": both(duplicate=0.1),
+    "all of these": both(
+        loss=0.3, bursts__bad_ms=200.0, latency_ms=90.0, jitter_ms=40.0, distribution="uniform", reorder=0.2,
+        duplicate=0.1,
+    ),
+}  # fmt: skip
+"""What an off-board link must bear without leaving OFFBOARD."""
+
 LATENCIES_MS = (4.0, 8.0, 16.0, 32.0, 64.0)
 LOSSES = (0.5, 0.7, 0.9)
 BURSTS_MS = (100.0, 400.0, 800.0)
@@ -56,6 +83,10 @@ SWEEPS: dict[str, dict[str, Overrides]] = {
     "mean burst": {f"{value:g} ms": both(bursts__bad_ms=value) for value in BURSTS_MS},
 }
 
+OFFBOARD_KEPT = "OFFBOARD kept"
+TABLES: dict[str, dict[str, Overrides]] = {"": LINKS, **SWEEPS, OFFBOARD_KEPT: WORSE}
+"""By title; the first has none."""
+
 
 def errors(outcome: Outcome) -> tuple[float, float]:
     """RMSE of the position in space, m, and of the three angles together, degrees; infinite for a lost flight."""
@@ -63,6 +94,12 @@ def errors(outcome: Outcome) -> tuple[float, float]:
         return inf, inf
     x, y, z, phi, theta, psi = outcome.rmse
     return sqrt(x * x + y * y + z * z), sqrt(phi * phi + theta * theta + psi * psi)
+
+
+def kept(outcomes: Sequence[Outcome]) -> str:
+    """As `cell`, and in how many flights the vehicle left OFFBOARD."""
+    left = sum(outcome.left_offboard > 0 for outcome in outcomes)
+    return f"{cell(outcomes)}; {f'OFFBOARD left in {left} of {len(outcomes)}' if left else 'kept'}"
 
 
 def cell(outcomes: Sequence[Outcome]) -> str:
@@ -108,7 +145,27 @@ The more of the loop is on the ground, the less delay it bears. `torque` and `bo
 the link; with the shipped gains it crosses over at about 105 rad/s with some 80° of phase margin, which a round trip of
 14 ms takes away. Just beyond, the vehicle still holds its position and shakes: the angles tell it before the position
 does. `attitude` closes the position loop alone over the link.
+
+## What OFFBOARD bears
+
+Each cell also says whether the vehicle stayed in OFFBOARD from the release to the end, or to where it was lost. The
+last column has gains for a slow link, about PX4's own (`MPC_XY_P`, `MPC_XY_VEL_P_ACC`):
+
+```toml
+{slow}```
+
+{worse}
+- *50 to 130 ms*: uniform, each way; messages overtake one another.
+- *20 % reorder*: held back by 20 ms more.
+
+The mode is kept by any setpoint that comes within `COM_OF_LOSS_T`; whether the flight is any good is the gains' affair.
 {failed}"""
+
+
+def as_toml(overrides: Overrides) -> str:
+    """The numbers of a level as a scenario has them."""
+    keys = {key: value for key, value in overrides.items() if isinstance(value, float)}
+    return "".join(f"{key} = {value:g}\n" for key, value in keys.items())
 
 
 def sweep(title: str, levels: Sequence[str], found: dict[tuple[str, str, str], list[Outcome]]) -> str:
@@ -126,11 +183,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     sweeps = {} if options.quick else SWEEPS
     cells = [("", link, level) for link in LINKS for level in LEVELS]
     cells += [(title, column, level) for title, columns in sweeps.items() for column in columns for level in LEVELS]
-    order = [(key, seed) for key in cells for seed in (seeds[:SWEEP_SEEDS] if key[0] else seeds)]
+    worse = {} if options.quick else WORSE
+    cells += [(OFFBOARD_KEPT, link, level) for link in worse for level in WORSE_LEVELS]
+    order = [(key, seed) for key in cells for seed in (seeds[:SWEEP_SEEDS] if key[0] in SWEEPS else seeds)]
     jobs = []
     for (title, column, level), seed in order:
-        link = SWEEPS[title][column] if title else LINKS[column]
-        jobs.append(engine.job(CASE, LEVELS[level] | link | extra, seed))
+        link = TABLES[title][column]
+        jobs.append(engine.job(CASE, WORSE_LEVELS[level] | link | extra, seed))
     outcomes = engine.campaign(jobs, workers=options.jobs, store=engine.store_of(options), title="links")
     found: dict[tuple[str, str, str], list[Outcome]] = {key: [] for key in cells}
     for (key, _), outcome in zip(order, outcomes, strict=True):
@@ -143,6 +202,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         short=f", flights of {engine.QUICK_S:g} s only (`--quick`: not comparable)" if options.quick else "",
         table=table(("link", *LEVELS), rows),
         sweeps="\n".join(sweep(title, list(LEVELS), found) for title in sweeps) or "(Not with `--quick`.)\n",
+        slow=as_toml(SLOW_GAINS),
+        worse=table(
+            ("link", *WORSE_LEVELS),
+            [[link, *(kept(found[OFFBOARD_KEPT, link, level]) for level in WORSE_LEVELS)] for link in worse],
+        )
+        if worse
+        else "(Not with `--quick`.)\n",
         failed="".join(f"\nNot ended as planned: {message}\n" for message in failed),
     )
     engine.publish(page, options)

@@ -15,6 +15,9 @@ from mavsitl.log.flight import FlightData, FlightError
 from mavsitl.log.ulog import MemoryRecorder
 from mavsitl.scenario import Flight, LinkModel
 
+OFFBOARD = 14
+"""vehicle_status.nav_state, PX4's number."""
+
 LOST_M = 20.0
 """A position error beyond this is a lost flight."""
 
@@ -55,6 +58,8 @@ class Sums:
         """Of the newest sample, from the release."""
         self.lost_s: float | None = None
         """When the position error first passed `LOST_M` or was not finite; nothing is added from then on."""
+        self.left_offboard = 0
+        """How often another mode began to fly, a fail-safe's."""
         self.weight_range = (1.0, 1.0)
         """Least and largest output weight of the PIDNNs off board so far, in multiples of its initial value."""
 
@@ -76,6 +81,11 @@ class Sums:
             self._released_us = int(land["timestamp"][land["landed"] == 0][0])
         if self._released_us is None or self.lost_s is not None:
             return
+        status = vehicle.get(topics.VEHICLE_STATUS.name)
+        if status is not None:
+            flown_us = status["timestamp"].astype(np.int64) - self._released_us
+            during = (flown_us >= 0) & (flown_us < 1e6 * self._duration_s)
+            self.left_offboard += int(np.count_nonzero(during & (status["nav_state"] != OFFBOARD)))
         truth = vehicle.get(topics.LOCAL_POSITION_TRUTH.name)
         if self._lossy and truth is not None:
             for topic in (topics.TRAJECTORY_SETPOINT, topics.ATTITUDE_SETPOINT):
