@@ -31,7 +31,9 @@ CHECK_S = 3.0
 SLOWEST_SPEED = 0.5
 """Clients miss a HEARTBEAT after 3 s of wall clock."""
 
-EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
+EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
+EXIT_SIGNAL = 128
+"""And the signal's number, as shells say it: 130 is Ctrl-C."""
 
 DESCRIPTION = """\
 A quadrotor in Dryden wind and an off-board controller, two processes that meet on MAVLink 2 over UDP alone.
@@ -47,7 +49,8 @@ A quadrotor in Dryden wind and an off-board controller, two processes that meet 
 
 EPILOG = """\
 Exit codes: 0 done; 1 the run failed (the message says which end and why); 2 wrong arguments or scenario;
-130 interrupted.
+130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by the terminal's end. A vehicle or a ground in real time runs until it
+is told to end: for these two a signal is the end, and 0. However it ends, logs and state are complete.
 Documentation: docs/index.md. Each command's own --help says more.
 """
 
@@ -194,6 +197,26 @@ class UsageError(ValueError):
     """Arguments that do not go together."""
 
 
+class Interrupted(KeyboardInterrupt):
+    """A signal that ends the program, wherever it is."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    raise Interrupted(number)
+
+
+def _on_signals(handler: Callable[[int, Any], None]) -> None:
+    """Ctrl-C, the usual request to end, and the end of the terminal, unless that is ignored (nohup)."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # the last where the system has it
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
+
+
 class _Formatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=32, width=110)
@@ -209,9 +232,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_USAGE
     try:
         return run(options)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         print(f"mavsitl {options.command}: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return EXIT_SIGNAL + (interrupt.number if isinstance(interrupt, Interrupted) else signal.SIGINT)
     except BrokenPipeError:
         # The reader of our output went away; point stdout elsewhere so that the interpreter's last flush is quiet.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -593,6 +616,7 @@ def _fly(options: argparse.Namespace) -> int:
     from mavsitl.clock import utc_stamp
     from mavsitl.report import run as runs
 
+    _on_signals(_interrupt)
     settings = _settings(options)
     names = options.scenarios or list(PAPER_SCENARIOS)
     flights = [_load(name, settings) for name in names]
@@ -709,22 +733,24 @@ class _Status:
 
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
-        self.stopped = False
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # the last where the system has it: the terminal was closed
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), self._stop)
+        self._signal = 0
+        _on_signals(self._stop)
+
+    @property
+    def stopped(self) -> bool:
+        return self._signal != 0
 
     def _stop(self, number: int, frame: Any) -> None:
-        if self.stopped:
-            raise KeyboardInterrupt
-        self.stopped = True
+        if self._signal:
+            raise Interrupted(number)
+        self._signal = number
 
     def stop(self) -> bool:
         return self.stopped
 
     def progress(self, flight_time_s: float) -> None:
-        if self.stopped:
-            raise KeyboardInterrupt
+        if self._signal:
+            raise Interrupted(self._signal)
         if self._as_json:
             self._print({"event": "progress", "flight_time_s": flight_time_s})
 
@@ -740,6 +766,9 @@ class _Status:
                 "event": "end", "simulated_s": outcome.simulated_s, "wall_s": outcome.wall_s, "speed": outcome.speed,
                 "wire_hash": outcome.wire_hash, "finished": outcome.finished,
                 "frames": outcome.frames, "rejected": outcome.rejected,
+                **({} if outcome.lateness_us is None else {
+                    "lateness_us": outcome.lateness_us, "rebased": outcome.rebased, "lost_s": outcome.lost_s,
+                }),
                 "dropped": outcome.dropped, **outcome.links,
             })  # fmt: skip
             return
@@ -756,7 +785,10 @@ class _Status:
                 print(f"{place} {direction}: {shown}")
         if outcome.lateness_us is not None:
             p50, p99 = outcome.lateness_us
-            print(f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; schedule moved {outcome.rebased} times")
+            print(
+                f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; "
+                f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
+            )
 
     def _print(self, event: dict[str, Any]) -> None:
         import msgspec
@@ -839,7 +871,7 @@ def _vehicle(options: argparse.Namespace) -> int:
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
             until_finished=bool(options.until_disarmed), state=_state_folder(options, system_id),
-            stop=status.stop, progress=None,
+            stop=status.stop, progress=None, report=status.say,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK

@@ -11,8 +11,12 @@ __all__ = ["LatenessHistogram", "PacedClock", "SimulatedClock", "monotonic_us"]
 SPIN_US = 60
 """The last stretch before a tick is waited for awake: the kernel wakes a sleeper about this much too late."""
 
-REBASE_US = 1_000_000
-"""A clock further behind than this gives up the lost time instead of running fast to catch up."""
+CATCH_UP_US = 100_000
+"""Wall time: a clock at most so far behind catches up, one further behind gives up what it lost.
+
+Caught-up ticks fly on the setpoint that was there before them, so this is also how old a controller's word may get by
+it: far below every time-out (COM_OF_LOSS_T, 1 s), and at 50 Hz five setpoints.
+"""
 
 
 def monotonic_us() -> int:
@@ -108,13 +112,14 @@ class PacedClock:
     """Simulated time held to wall time: tick k is due at ``origin + k * period / speed`` on the monotonic clock.
 
     The schedule is absolute, so single late ticks do not add up. A clock that is late returns at once and catches up by
-    ticks without a wait. When it is more than one second behind (a suspended process), the schedule is moved instead
-    and `rebased` counts it: simulated time neither jumps nor rushes.
+    ticks without a wait. When it is more than `CATCH_UP_US` behind (a suspended process, an overloaded machine), the
+    schedule is moved instead, and `rebased` and `lost_us` count it: simulated time neither jumps nor rushes.
 
     Attributes:
         now_us: simulated time, microseconds.
         lateness: how late `wait_until` returned against the schedule.
         rebased: times the schedule was moved.
+        lost_us: wall time that was given up by that, microseconds.
     """
 
     def __init__(
@@ -135,6 +140,7 @@ class PacedClock:
         self.now_us = 0
         self.lateness = LatenessHistogram()
         self.rebased = 0
+        self.lost_us = 0
         self._monotonic_ns = monotonic_ns
         self._sleep_s = sleep_s
         self._origin_ns = monotonic_ns()
@@ -162,9 +168,10 @@ class PacedClock:
                 self._sleep_s(spare_ns * 1e-9)
             now_ns = self._monotonic_ns()
         self.lateness.add(now_ns - due_ns)
-        if now_ns - due_ns > REBASE_US * 1000:
+        if now_ns - due_ns > CATCH_UP_US * 1000:
             self._origin_ns += now_ns - due_ns
             self.rebased += 1
+            self.lost_us += (now_ns - due_ns) // 1000
         self.now_us = tick_us
 
     def spare_s(self, tick_us: int) -> float:

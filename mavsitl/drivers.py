@@ -17,7 +17,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from mavsitl.clock import LatenessHistogram, PacedClock, monotonic_us
+from mavsitl.clock import CATCH_UP_US, LatenessHistogram, PacedClock, monotonic_us
+from mavsitl.keep import Keeper, Keeping
 from mavsitl.link.base import Link, LinkError, LinkSilent
 from mavsitl.link.exchange import EXCHANGE_BYTES, HELLO, pack, unpack
 from mavsitl.link.sockets import wait_any
@@ -40,6 +41,11 @@ SETUP_SIGNING = 256
 SETUP_SIGNING_ID = SETUP_SIGNING.to_bytes(3, "little")
 """As a MAVLink 2 header has it; where the bytes stand elsewhere, looking closer does no harm."""
 FLUSH_INTERVAL_US = 1_000_000
+"""Logs are handed to the system once a second of simulated time."""
+FLUSH_WALL_US = 500_000
+"""Real time: and as often on the wall clock, so that a kill costs less than a second of whatever is slower."""
+SAY_LOST_US = 5_000_000
+"""Real time: wall clock between two warnings that the schedule was moved."""
 CHECK_WAIT_S, NO_SOCKET_WAIT_S = 0.02, 0.002
 """Of a check: longest wait for a datagram; and a pause where there is nothing to wait for, a server not there yet."""
 
@@ -76,9 +82,15 @@ class VehicleCore(Core, Protocol):
         """Stamp that the newest setpoint echoes; -1 before the first."""
 
 
-class RealTimeVehicleCore(VehicleCore, Protocol):
+class RealTimeVehicleCore(VehicleCore, Keeping, Protocol):
+    def warn(self, text: str) -> None:
+        """What the driver has to say to whoever flies it."""
+
     def receive(self, port: int, datagram: bytes, at_us: int | None = None) -> int:
         """`at_us`: when it came, from the last tick to just before the next; None: at the tick."""
+
+    def close(self) -> None:
+        """The end: after it there may be something `unsaved` once more, and nothing after that."""
 
 
 class GroundCore(Core, Protocol):
@@ -101,10 +113,11 @@ class Tap:
     tlog: TlogWriter | None = None
     record: Callable[[int], None] | None = None
     """Told the time once a second, before the flush: for what is logged at that rate."""
-    flush: Callable[[int], None] | None = None
+    flush: Callable[[], None] | None = None
     started_us: int | None = None
     """Wall clock at the first datagram of the ground: what came before is start-up, not flying."""
     _flushed_us: int = 0
+    _flushed_wall_us: int = 0
 
     def hear(self, direction: Direction, now_us: int, datagram: bytes) -> None:
         self.wire.update(direction, datagram)
@@ -115,13 +128,15 @@ class Tap:
                 datagram = _without_keys(datagram)
             self.tlog.write(now_us, datagram)
 
-    def tick(self, now_us: int) -> None:
-        if now_us - self._flushed_us >= FLUSH_INTERVAL_US:
+    def tick(self, now_us: int, wall_us: int = 0) -> None:
+        """Once a control period. `wall_us`: in real time, where simulated time may be slower than the clock."""
+        if now_us - self._flushed_us >= FLUSH_INTERVAL_US or wall_us - self._flushed_wall_us >= FLUSH_WALL_US:
             self._flushed_us = now_us
+            self._flushed_wall_us = wall_us
             if self.record is not None:
                 self.record(now_us)
             if self.flush is not None:
-                self.flush(now_us)
+                self.flush()
             if self.tlog is not None:
                 self.tlog.flush()
 
@@ -473,7 +488,9 @@ class RealTime:
     wall_us: int
     lateness: LatenessHistogram
     rebased: int
-    """How often the run was more than a second late and the schedule was moved; simulated time never jumps."""
+    """How often the run was so late that the schedule was moved; simulated time never jumps."""
+    lost_us: int
+    """Wall time that was given up by that."""
 
 
 def run_realtime_vehicle(
@@ -484,6 +501,7 @@ def run_realtime_vehicle(
     speed: float = 1.0,
     until_finished: bool = False,
     stop: Callable[[], bool] = lambda: False,
+    say: Callable[[str], None] = lambda text: None,
     progress: Progress | None = None,
     wait: Callable[[Sequence[Link], float], bool] = wait_any,
     due_s: Callable[[], float] = lambda: math.inf,
@@ -491,14 +509,22 @@ def run_realtime_vehicle(
     """The vehicle on the wall clock, times `speed`. `links` in the order of its ports; peers join by a valid frame.
 
     Physics, streams and decisions keep to the ticks. What comes between two of them is taken at once, and what the
-    services answer to it is sent at once. `wait` tells whether something came within a time in seconds. `due_s`: in so
-    many seconds an impaired link has something to hand over.
+    services answer to it is sent at once. `wait` tells whether something came within a time in seconds; `say` and the
+    vehicle's links are told when real time could not be kept. `due_s`: in so many seconds an impaired link has
+    something to hand over. However it ends, the vehicle is closed, and what it had to keep is on the disk.
     """
     clock = PacedClock(vehicle.period_us, speed)
     clock.start()
     start_us = monotonic_us()
     throttle = _Throttle(progress)
+    keeper = Keeper(vehicle)
     now_us = 0
+
+    def warn(text: str) -> None:
+        vehicle.warn(text)
+        say(text)
+
+    lost = _Lost(warn)
 
     def send() -> None:
         for port, link in enumerate(links):
@@ -516,26 +542,50 @@ def run_realtime_vehicle(
                 if vehicle.receive(port, datagram, clock.time_us()):
                     link.admit(source, wall_us)
 
-    while not stop() and not (until_finished and vehicle.finished):
-        vehicle.step(now_us)
-        send()
-        next_us = now_us + vehicle.period_us
-        for _ in range(WAKES):
-            spare_s = clock.spare_s(next_us)
-            if spare_s <= GUARD_S:
-                break
-            limit_s, soon_s = spare_s - WAKE_S, due_s()
-            came = wait(links, min(limit_s, soon_s)) or soon_s < limit_s
-            if not came or clock.spare_s(next_us) <= GUARD_S:
-                break
-            take()
+    try:
+        while not stop() and not (until_finished and vehicle.finished):
+            vehicle.step(now_us)
             send()
-        clock.wait_until(next_us)
-        take()
-        tap.tick(now_us)
-        throttle(vehicle)
-        now_us = next_us
-    return RealTime(now_us, monotonic_us() - start_us, clock.lateness, clock.rebased)
+            next_us = now_us + vehicle.period_us
+            for _ in range(WAKES):
+                spare_s = clock.spare_s(next_us)
+                if spare_s <= GUARD_S:
+                    break
+                limit_s, soon_s = spare_s - WAKE_S, due_s()
+                came = wait(links, min(limit_s, soon_s)) or soon_s < limit_s
+                if not came or clock.spare_s(next_us) <= GUARD_S:
+                    break
+                take()
+                send()
+            clock.wait_until(next_us)
+            take()
+            wall_us = monotonic_us()
+            keeper.step(wall_us)
+            tap.tick(now_us, wall_us)
+            if clock.lost_us != lost.told_us:
+                lost.tell(clock.lost_us, wall_us)
+            throttle(vehicle)
+            now_us = next_us
+    finally:
+        vehicle.close()
+        keeper.close(monotonic_us())
+    return RealTime(now_us, monotonic_us() - start_us, clock.lateness, clock.rebased, clock.lost_us)
+
+
+class _Lost:
+    """Says at a bounded rate that the wall clock could not be kept."""
+
+    def __init__(self, warn: Callable[[str], None]) -> None:
+        self._warn = warn
+        self._next_us = -math.inf
+        self.told_us = 0
+        """Of the lost time."""
+
+    def tell(self, lost_us: int, now_us: int) -> None:
+        if now_us >= self._next_us:
+            self._next_us = now_us + SAY_LOST_US
+            self._warn(f"Suspended or overloaded: {(lost_us - self.told_us) / 1e6:.1f} s of real time given up")
+            self.told_us = lost_us
 
 
 def run_realtime_ground(
@@ -544,32 +594,43 @@ def run_realtime_ground(
     tap: Tap,
     *,
     stop: Callable[[], bool] = lambda: False,
+    say: Callable[[str], None] = lambda text: None,
     progress: Progress | None = None,
 ) -> tuple[int, int]:
     """The ground on the wall clock: it steps as soon as telemetry comes, and at least once a control period.
 
+    Its own clock is the wall's less what it was suspended for, which `say` is told: that was no silence of the vehicle.
     Returns the microseconds that passed on the vehicle's clock and on the wall since the first state.
     """
     first: tuple[int, int] | None = None
     last = (0, 0)
     throttle = _Throttle(progress)
-    start_us = monotonic_us()
+    lost = _Lost(say)
+    start_us = woken_us = monotonic_us()
+    lost_us = 0
     period_s = ground.period_us / 1e6
     while not stop() and not ground.finished:
         link.wait(period_s)
-        now_us = monotonic_us() - start_us
-        for datagram, source in link.receive(now_us):
+        wall_us = monotonic_us()
+        late_us = wall_us - woken_us - ground.period_us
+        woken_us = wall_us
+        if late_us > CATCH_UP_US:
+            lost_us += late_us
+        if lost_us != lost.told_us:
+            lost.tell(lost_us, wall_us)
+        now_us = wall_us - start_us - lost_us
+        for datagram, source in link.receive(wall_us - start_us):
             tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
             if ground.receive(0, datagram):
-                link.admit(source, now_us)
+                link.admit(source, wall_us - start_us)
         ground.step(now_us)
         if ground.vehicle_time_us >= 0:
-            last = (ground.vehicle_time_us, now_us)
+            last = (ground.vehicle_time_us, wall_us)
             first = last if first is None or last[0] < first[0] else first
         for answer in ground.datagrams(0, combine=False):
             tap.hear(Direction.FROM_GROUND, now_us, answer)
             link.send(answer)
-        tap.tick(now_us)
+        tap.tick(now_us, wall_us)
         throttle(ground)
     return (0, 0) if first is None else (last[0] - first[0], last[1] - first[1])
 

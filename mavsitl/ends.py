@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import ipaddress
+import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
@@ -13,14 +15,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mavsitl import __version__, drivers, wings
 from mavsitl.clock import monotonic_us, unix_us
-from mavsitl.drivers import Progress, Tap
+from mavsitl.drivers import Progress, RealTime, Tap
 from mavsitl.herald import Herald
 from mavsitl.link.address import Address
 from mavsitl.link.base import Link, LinkError
 from mavsitl.link.endpoint import open_link
 from mavsitl.link.settings import PLACES
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
-from mavsitl.log.errors import LogError
+from mavsitl.log.errors import Failed, LogError
 from mavsitl.log.tlog import TlogWriter
 from mavsitl.scenario import Flight, LinkModel
 
@@ -53,8 +55,11 @@ class Outcome:
     rejected: int
     """Bytes that looked like frames and were not."""
     lateness_us: tuple[float, float] | None = None
-    """p50 and p99 of the tick's lateness; real time only."""
+    """p50 and p99 of the tick's lateness; of a vehicle in real time only."""
     rebased: int = 0
+    """How often the schedule was moved, the machine being too slow or the process suspended."""
+    lost_s: float = 0.0
+    """Wall time given up by that."""
     links: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
     """Of the vehicle's impaired links ("link", "gcs_link", "tcp_link"), by direction:
     `mavsitl.link.impaired.Statistics`."""
@@ -154,8 +159,14 @@ class _LiveLinks:
 
 
 @contextmanager
-def _logs(folder: Path | None, end: End, flight: Flight) -> Iterator[tuple[Recorder, Tap]]:
-    """Recorder and tap of an end. Without a folder the rows are dropped as they come."""
+def _logs(
+    folder: Path | None, end: End, flight: Flight, failed: Failed | None = None
+) -> Iterator[tuple[Recorder, Tap]]:
+    """Recorder and tap of an end. Without a folder the rows are dropped as they come.
+
+    With `failed` the logs are of an end that outlives them: a full disk ends the log and not the flight, and the logs
+    of an earlier process in this folder are kept beside the new ones.
+    """
     if folder is None:
         yield NullRecorder(), Tap()
         return
@@ -169,15 +180,34 @@ def _logs(folder: Path | None, end: End, flight: Flight) -> Iterator[tuple[Recor
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LogError(f"{folder}: no logs can be written there: {error.strerror or error}") from error
+    if failed is not None:
+        _keep_older(folder / name)
+        if end == "vehicle":
+            _keep_older(folder / WIRE_LOG)
     info = {"sys_name": "mavsitl", "ver_sw": __version__, "scenario": flight.name}
     parameters = flight.airframe.parameters | flight.scenario.parameters
-    with UlogWriter(folder / name, info, parameters, topics=topics) as writer:
-        tlog = TlogWriter(folder / WIRE_LOG) if end == "vehicle" else None
+    with UlogWriter(folder / name, info, parameters, topics=topics, failed=failed) as writer:
+        tlog = TlogWriter(folder / WIRE_LOG, failed) if end == "vehicle" else None
         try:
             yield writer, Tap(tlog=tlog, flush=writer.flush)
         finally:
             if tlog is not None:
                 tlog.close()
+
+
+def _keep_older(path: Path) -> None:
+    """A log that is there gets a number: ``vehicle-001.ulg``, the highest is the youngest of them."""
+    if not os.path.lexists(path):
+        return
+    taken = [int(match[1]) for other in path.parent.iterdir() if (match := _numbered(path).fullmatch(other.name))]
+    try:
+        path.rename(path.with_name(f"{path.stem}-{max(taken, default=0) + 1:03}{path.suffix}"))
+    except OSError as error:
+        raise LogError(f"{path}: cannot be renamed to make room: {error.strerror or error}") from error
+
+
+def _numbered(path: Path) -> re.Pattern[str]:
+    return re.compile(rf"{re.escape(path.stem)}-(\d{{3,9}}){re.escape(path.suffix)}")
 
 
 class _NullRows:
@@ -280,13 +310,21 @@ def ground_lockstep(
 def vehicle_realtime(
     flight: Flight, links: VehicleLinks, folder: Path | None, *,
     system_id: int, wing: str | None, speed: float, until_finished: bool, state: Path | None,
-    stop: Callable[[], bool], progress: Progress | None,
+    stop: Callable[[], bool], progress: Progress | None, report: Callable[[str], None] = lambda text: None,
 ) -> Outcome:  # fmt: skip
     """The vehicle on the wall clock, with PX4 SITL's two links and TCP where asked for. Raises as `vehicle_lockstep`.
 
-    `state` is the folder of what outlives the process, None: nothing does.
+    `state` is the folder of what outlives the process, None: nothing does. `report` is told what went wrong on the
+    machine, and so are the links: logs that cannot be written any more, real time that was not kept.
     """
     opened: list[Link] = []
+    core: Any = None
+
+    def log_failed(error: LogError) -> None:
+        text = f"Logging has ended: {error}"
+        report(text)
+        core.warn(text)
+
     try:
         opened.append(
             UdpLink(
@@ -308,7 +346,7 @@ def vehicle_realtime(
         live = _LiveLinks(opened, flight, speed)
         with ExitStack() as stack:
             with Herald(wings.find_boot(wing), system_id, opened) as herald:
-                recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight))
+                recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight, log_failed))
                 build = wings.find(wings.VEHICLE_GROUP, wing)
                 core = build(
                     flight, recorder, seed=flight.scenario.seed, system_id=system_id,
@@ -324,15 +362,11 @@ def vehicle_realtime(
             if herald.sequence:
                 core.continue_from(herald.sequence)
             watch = _Watch(core)
-            try:
-                timing = drivers.run_realtime_vehicle(
-                    core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, progress=progress,
-                    due_s=live.due_s,
-                )  # fmt: skip
-            finally:
-                core.close()
-            lateness = (timing.lateness.p50_us, timing.lateness.p99_us)
-            return watch.outcome(timing.simulated_us, tap, lateness, timing.rebased, timing.wall_us, live.statistics())
+            timing = drivers.run_realtime_vehicle(
+                core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, say=report,
+                progress=progress, due_s=live.due_s,
+            )  # fmt: skip
+            return watch.outcome(timing.simulated_us, tap, timing, links=live.statistics())
     finally:
         for link in opened:
             link.close()
@@ -350,11 +384,13 @@ def ground_realtime(
     """The ground on the wall clock, on any endpoint. Raises as `vehicle_lockstep`."""
     link = open_link(address, port_option="--link udpin:HOST:PORT", host_option="--link udpin:HOST:PORT")
     try:
-        with _logs(folder, "ground", flight) as (recorder, tap):
+        with _logs(folder, "ground", flight, lambda error: report(f"logging has ended: {error}")) as (recorder, tap):
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
-            simulated_us, wall_us = drivers.run_realtime_ground(core, link, tap, stop=stop, progress=progress)
+            simulated_us, wall_us = drivers.run_realtime_ground(
+                core, link, tap, stop=stop, say=report, progress=progress
+            )
             return watch.outcome(simulated_us, tap, wall_us=wall_us)
     finally:
         link.close()
@@ -370,10 +406,10 @@ def in_memory(
     ):
         vehicle_flush, ground_flush = tap.flush, ground_tap.flush
 
-        def flush(now_us: int) -> None:
+        def flush() -> None:
             for each in (vehicle_flush, ground_flush):
                 if each is not None:
-                    each(now_us)
+                    each()
 
         tap.flush = flush
         vehicle = wings.find(wings.VEHICLE_GROUP)(flight, vehicle_recorder, seed=flight.scenario.seed, lockstep=True)
@@ -498,17 +534,19 @@ class _Watch:
         self,
         simulated_us: int,
         tap: Tap,
-        lateness_us: tuple[float, float] | None = None,
-        rebased: int = 0,
+        timing: RealTime | None = None,
         wall_us: int | None = None,
         links: dict[str, dict[str, dict[str, float]]] | None = None,
         heard_by: Any = None,
     ) -> Outcome:
-        """`wall_us`: None is since the first exchange. `heard_by`: the core whose dropped input counts; None: this."""
+        """`timing` of a vehicle in real time; `wall_us`: None is since the first exchange. `heard_by`: the core whose
+        dropped input counts; None: this."""
         counters = self._core.counters
         dropped = asdict((heard_by or self._core).counters)
         if tap.record is not None:
             tap.record(simulated_us)
+        if timing is not None:
+            wall_us = timing.wall_us
         if wall_us is None:
             wall_us = monotonic_us() - (tap.started_us or self._start_us)
         return Outcome(
@@ -518,8 +556,9 @@ class _Watch:
             finished=self._core.succeeded,
             frames=counters.frames,
             rejected=counters.rejected,
-            lateness_us=lateness_us,
-            rebased=rebased,
+            lateness_us=None if timing is None else (timing.lateness.p50_us, timing.lateness.p99_us),
+            rebased=0 if timing is None else timing.rebased,
+            lost_s=0.0 if timing is None else timing.lost_us / 1e6,
             links=links or {},
             dropped={name: count for name, count in dropped.items() if count and name != "frames"},
         )

@@ -72,8 +72,10 @@ def fly(scenario: str, settings: Sequence[str], folder: Path, on_event: OnEvent)
         f"{LOOPBACK}:{ground_port}",
     ]
     ground = ["ground", *common, "--link", f"udpin:{LOOPBACK}:{ground_port}", "--vehicle", f"{LOOPBACK}:{vehicle_port}"]
-    processes = {"ground": _start(ground), "vehicle": _start(vehicle)}
+    processes: dict[str, subprocess.Popen[bytes]] = {}
     try:
+        processes["ground"] = _start(ground)
+        processes["vehicle"] = _start(vehicle)
         return _follow(processes, on_event)
     finally:
         for process in processes.values():

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 
 class LogError(OSError):
     """A log cannot be written or read; the message names the file and the reason."""
+
+
+Failed: TypeAlias = Callable[[LogError], None]
+"""Is told that a log cannot be written any more."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import struct
 from enum import IntEnum
 from hashlib import blake2b
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
 
-from mavsitl.log.errors import LogError
+from mavsitl.log.errors import Failed, LogError
 
 _STAMP = struct.Struct(">Q")
 _PREFIX = struct.Struct("<BI")
@@ -55,13 +55,15 @@ def frames(datagram: bytes) -> list[bytes]:
 class TlogWriter:
     """Writes a .tlog: before each frame its time in us, 8 bytes, big-endian. Raises `LogError` as `UlogWriter` does."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, failed: Failed | None = None) -> None:
+        """`failed` is told, once, when the file cannot be written any more, and the log ends there; None: raise."""
         self.path = path
+        self._failed = failed
         self._waiting = bytearray()
         self.left_out_bytes = 0
         """Bytes of datagrams that belonged to no frame and so are not in the file."""
         try:
-            self._file: BinaryIO = path.open("wb")
+            self._file: FileIO = path.open("wb", buffering=0)
         except OSError as error:
             raise self._error(error) from error
 
@@ -84,11 +86,23 @@ class TlogWriter:
     def flush(self) -> None:
         """Hand everything written so far to the system."""
         waiting, self._waiting = self._waiting, bytearray()
+        if self._file.closed:
+            if self._failed is None:
+                raise LogError(f"{self.path}: cannot be written: it is closed")
+            return
         try:
-            self._file.write(waiting)
-            self._file.flush()
+            self._write(waiting)
         except OSError as error:
-            raise self._error(error) from error
+            self._file.close()  # what comes after a torn frame would be read at the wrong place
+            if self._failed is None:
+                raise self._error(error) from error
+            self._failed(self._error(error))
+
+    def _write(self, data: bytearray) -> None:
+        with memoryview(data) as view:
+            written = 0
+            while written < len(data):
+                written += self._file.write(view[written:])
 
     def close(self) -> None:
         """More than once is harmless."""

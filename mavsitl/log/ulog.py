@@ -16,11 +16,11 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from mavsitl.log.errors import Failed
 from mavsitl.log.errors import LogError as LogError
 from mavsitl.log.topics import DATA_MESSAGE, TOPICS, Topic
 
 MAGIC = b"ULog\x01\x12\x35\x01"
-FLUSH_PERIOD_US = 1_000_000
 _BUFFER_BYTES = 1 << 18
 _TEXT_BYTES = 4096
 _FLOAT_MAX = float(np.finfo(np.float32).max)
@@ -141,11 +141,13 @@ class MemoryRecorder:
 class _FileSink(_Sink):
     """Drains into a file when full. Whole messages only, so what is on disk is always readable."""
 
-    __slots__ = ("_file", "_path")
+    __slots__ = ("_ended", "_failed", "_file", "_path")
 
-    def __init__(self, path: Path, capacity: int) -> None:
+    def __init__(self, path: Path, capacity: int, failed: Failed | None = None) -> None:
         super().__init__(capacity)
         self._path = path
+        self._failed = failed
+        self._ended = False
         try:
             self._file: FileIO | None = path.open("wb", buffering=0)
         except OSError as error:
@@ -165,6 +167,9 @@ class _FileSink(_Sink):
 
     def drain(self) -> None:
         """Raises `LogError`, and then closes the file: what comes after a torn message would not be readable."""
+        if self._ended:
+            self.offset = 0
+            return
         file = self._file
         if file is None:
             raise LogError(f"{self._path}: cannot be written: it is closed")
@@ -176,7 +181,11 @@ class _FileSink(_Sink):
         except OSError as error:
             self._file = None
             file.close()
-            raise _write_error(self._path, error) from error
+            failure = _write_error(self._path, error)
+            if self._failed is None:
+                raise failure from error
+            self._ended = True
+            self._failed(failure)
         self.offset = 0
 
     def close(self) -> None:
@@ -184,6 +193,8 @@ class _FileSink(_Sink):
             return
         self.drain()
         file, self._file = self._file, None
+        if file is None:  # that was its end
+            return
         try:
             file.close()
         except OSError as error:
@@ -205,10 +216,11 @@ class UlogWriter:
         *,
         topics: Iterable[Topic] = TOPICS,
         start_us: int = 0,
+        failed: Failed | None = None,
     ) -> None:
+        """`failed` is told, once, when the file cannot be written any more, and the log ends there; None: raise."""
         self.path = path
         asked = tuple(topics)
-        self._flushed_us = start_us
         self._drains: list[Callable[[], None]] = []
         parts = [MAGIC + struct.pack("<Q", start_us), _message("B", bytes(40))]
         parts += [_message("F", text.encode("ascii")) for text in dict.fromkeys(topic.ulog_format for topic in asked)]
@@ -222,7 +234,7 @@ class UlogWriter:
                 parts.append(_message("P", _keyed(f"float {key}", struct.pack("<f", number))))
         for message_id, topic in enumerate(asked):
             parts.append(_message("A", struct.pack("<BH", topic.instance, message_id) + topic.name.encode("ascii")))
-        self._sink = _FileSink(path, _BUFFER_BYTES)
+        self._sink = _FileSink(path, _BUFFER_BYTES, failed)
         self._rows = {topic.key: Rows(topic, message_id, self._sink) for message_id, topic in enumerate(asked)}
         self._sink.write(b"".join(parts))
         self._sink.drain()
@@ -239,13 +251,11 @@ class UlogWriter:
         body = text.encode("utf-8")[:_TEXT_BYTES].decode("utf-8", "ignore").encode("utf-8")
         self._sink.write(_message("L", struct.pack("<BQ", ord("0") + level, timestamp_us) + body))
 
-    def flush(self, now_us: int) -> None:
-        """Hand the rows to the system once per simulated second, so that a killed process leaves a readable file."""
-        if now_us - self._flushed_us >= FLUSH_PERIOD_US:
-            self._flushed_us = now_us
-            for drain in self._drains:
-                drain()
-            self._sink.drain()
+    def flush(self) -> None:
+        """Hand the rows to the system, which keeps them whatever becomes of the process."""
+        for drain in self._drains:
+            drain()
+        self._sink.drain()
 
     def attach(self, drain: Callable[[], None]) -> None:
         self._drains.append(drain)

@@ -9,6 +9,7 @@ from typing import Annotated
 import msgspec
 
 import mavsitl
+from mavsitl.keep import replace_file
 from mavsitl.report.metrics import PAPER_TABLES, paper_case
 from mavsitl.scenario import Flight
 
@@ -85,11 +86,9 @@ def scenario_digest(flight: Flight) -> str:
 def write_run(folder: Path, run: Run) -> Path:
     """Write `run.json` whole or not at all, making the folder. Raises `RunError`."""
     path = folder / RUN_FILE
-    new = folder / f"{RUN_FILE}.new"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        new.write_bytes(msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
-        new.replace(path)
+        replace_file(path, msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path

@@ -20,6 +20,8 @@ from itertools import count, islice
 from pathlib import Path
 from typing import NamedTuple, NoReturn, Protocol, TypeAlias
 
+from mavsitl.keep import Work
+
 __all__ = [
     "MAX_ENTRIES",
     "Entry",
@@ -111,7 +113,7 @@ class Writer(Protocol):
         """Raises `OSError` ENOSPC where the quota ends; nothing is written then."""
 
     def commit(self) -> None:
-        """Put it in its place, on the disk. It is closed afterwards, even where that fails."""
+        """Put it in its place, whole. It is closed afterwards, even where that fails."""
 
     def abandon(self) -> None:
         """Forget it."""
@@ -308,28 +310,45 @@ class _FolderWriter:
         if self._handle < 0:
             return
         try:
-            os.fsync(self._handle)
             os.replace(self._unfinished, self._name, src_dir_fd=self._directory, dst_dir_fd=self._directory)
-            os.fsync(self._directory)
         except OSError:
-            with suppress(OSError):
-                os.unlink(self._unfinished, dir_fd=self._directory)
+            self.abandon()
             raise
-        finally:
-            self._close()
+        self._folder.settle(self._handle, self._directory)
+        self._forget()
 
     def abandon(self) -> None:
         if self._handle < 0:
             return
         with suppress(OSError):
             os.unlink(self._unfinished, dir_fd=self._directory)
-        self._close()
-
-    def _close(self) -> None:
         os.close(self._handle)
         os.close(self._directory)
+        self._forget()
+
+    def _forget(self) -> None:
         self._handle = self._directory = -1
         self._folder.measure()
+
+
+class _Settlement:
+    """A file in its place whose bytes may still be in the system's memory: closed once they are on the disk."""
+
+    def __init__(self, handle: int, directory: int) -> None:
+        self._handles = (handle, directory)
+
+    def write(self) -> None:
+        """Raises `OSError`."""
+        try:
+            for handle in self._handles:
+                os.fsync(handle)
+        finally:
+            for handle in self._handles:
+                os.close(handle)
+
+
+MAX_UNSETTLED = 16
+"""Files that may wait to be settled, with two handles each."""
 
 
 class Folder:
@@ -339,8 +358,14 @@ class Folder:
     time: uploads that an earlier one left unfinished are removed.
     """
 
-    def __init__(self, root: str | os.PathLike[str], quota: Quota | None = None) -> None:
-        """`root` itself need not exist yet; for a sandbox it is made. Needs an operating system with openat (POSIX)."""
+    def __init__(
+        self, root: str | os.PathLike[str], quota: Quota | None = None, *, settles_later: bool = False
+    ) -> None:
+        """`root` itself need not exist yet; for a sandbox it is made. Needs an operating system with openat (POSIX).
+
+        `settles_later`: to wait until a new file is on the disk takes some milliseconds, for which a control loop that
+        answers clients has no time; somebody else asks for what is `unsettled`.
+        """
         if os.open not in os.supports_dir_fd:  # pragma: no cover
             raise NotImplementedError("no directory handles on this system: a folder cannot be served safely")
         self._root = Path(root)
@@ -348,6 +373,8 @@ class Folder:
         self._used_bytes = 0
         self._used_files = 0
         self._unfinished = count()
+        self._settles_later = settles_later
+        self._unsettled: list[_Settlement] = []
         if quota is not None:
             self._root.mkdir(parents=True, exist_ok=True)
             self.measure(tidy=True)
@@ -360,6 +387,25 @@ class Folder:
     def used(self) -> Quota:
         """What a sandbox contains by now."""
         return Quota(self._used_bytes, self._used_files)
+
+    # -- the disk
+
+    def settle(self, handle: int, directory: int) -> None:
+        """A new file has taken its place: see to it that it outlives the system, too. Takes the handles."""
+        settlement = _Settlement(handle, directory)
+        if self._settles_later and len(self._unsettled) < MAX_UNSETTLED:
+            self._unsettled.append(settlement)
+        else:
+            with suppress(OSError):
+                settlement.write()
+
+    def unsettled(self) -> list[Work]:
+        """What is to be done for files that are in their place, safe from a kill, and not from a crash of the system.
+
+        It is handed out once.
+        """
+        waiting, self._unsettled = self._unsettled, []
+        return [*waiting]
 
     # -- reading
 
@@ -488,7 +534,8 @@ class Folder:
             with suppress(OSError), self._directory(path) as directory, os.scandir(directory) as scan:
                 for item in scan:
                     if tidy and item.name.startswith(_UNFINISHED):
-                        os.unlink(item.name, dir_fd=directory)
+                        with suppress(OSError):
+                            os.unlink(item.name, dir_fd=directory)
                         continue
                     used_files += 1
                     status = item.stat(follow_symlinks=False)

@@ -83,14 +83,15 @@ def test_clearing_what_is_empty_writes_nothing(monkeypatch: pytest.MonkeyPatch) 
     client = Client()
     made: list[str] = []
 
-    def to_json() -> str:
+    def to_document() -> dict[str, object]:
         made.append("once more")
-        return "{}"
+        return {}
 
-    monkeypatch.setattr(client.vehicle.plan, "to_json", to_json)
+    monkeypatch.setattr(client.vehicle.plan, "to_document", to_document)
     for _ in range(50):
         client.send(mavlink.MAVLink_mission_clear_all_message(1, 1, 255))
     client.run(1.0)
+    client.vehicle.unsaved(0)
     assert made == []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from mavsitl_vehicle.vehicle import Vehicle
 from mavsitl.codec import encode, parse
 from mavsitl.dialect import mavlink
 from mavsitl.ends import NullRecorder
+from mavsitl.keep import carry_out
 from mavsitl.log.ulog import MemoryRecorder
 from mavsitl.services.mission import FENCE, MISSION, RALLY, same_plan
 from tests.autopilot.conftest import GCS, OFFBOARD, Client, flight
@@ -47,6 +49,14 @@ class Kept(Client):
         self.vehicle.step(0)
         self._collect()
 
+    def run(self, seconds: float, each: Callable[[], object] | None = None) -> None:
+        super().run(seconds, each)
+        carry_out(self.vehicle)
+
+    def close(self) -> None:
+        self.vehicle.close()
+        carry_out(self.vehicle)
+
 
 def test_parameters_and_plans_survive_a_restart(tmp_path: Path) -> None:
     first = Kept(tmp_path)
@@ -61,7 +71,7 @@ def test_parameters_and_plans_survive_a_restart(tmp_path: Path) -> None:
     for kind, items in plans.items():
         assert upload(first, items, kind) == mavlink.MAV_MISSION_ACCEPTED
     kept = [first.vehicle.plan.stores.items(kind) for kind in plans]
-    first.vehicle.close()
+    first.close()
 
     second = Kept(tmp_path)
     second.run(1.2)
@@ -75,7 +85,7 @@ def test_parameters_and_plans_survive_a_restart(tmp_path: Path) -> None:
 
 
 def test_what_is_written_without_a_proper_end_is_there(tmp_path: Path) -> None:
-    """A process that is killed: changes are on the disk a moment after they were made."""
+    """A process that is killed: changes are handed over when they were made, and not at the end alone."""
     first = Kept(tmp_path)
     first.send(parameter("MIS_TAKEOFF_ALT", 4.0))
     first.run(0.5)
@@ -85,7 +95,7 @@ def test_what_is_written_without_a_proper_end_is_there(tmp_path: Path) -> None:
 def test_the_system_id_that_was_asked_for_outweighs_the_one_that_was_kept(tmp_path: Path) -> None:
     first = Kept(tmp_path)
     first.send(parameter("MAV_SYS_ID", 9))
-    first.vehicle.close()
+    first.close()
     again = Vehicle(flight(), NullRecorder(), seed=1, system_id=3, state=tmp_path)
     assert again.parameters["MAV_SYS_ID"] == 3
 
@@ -122,6 +132,7 @@ def test_without_a_folder_nothing_is_written(tmp_path: Path, monkeypatch: pytest
     client.send(parameter("MIS_TAKEOFF_ALT", 4.0))
     client.run(1.0)
     client.vehicle.close()
+    carry_out(client.vehicle)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -9,6 +9,7 @@ from mavsitl_vehicle.vehicle import Vehicle
 
 from mavsitl.codec import encode, parse
 from mavsitl.dialect import mavlink
+from mavsitl.keep import carry_out
 from mavsitl.log.ulog import MemoryRecorder
 from mavsitl.signing import EPOCH_UNIX_US, Key, setup_signing
 from tests.autopilot.conftest import flight
@@ -42,6 +43,7 @@ class Signer:
             self.clock_us += 4000
             self.vehicle.step(self.now_us)
             self._collect()
+        carry_out(self.vehicle)
 
     def _collect(self) -> None:
         self.frames = [frame for data in self.vehicle.datagrams(0, combine=False) for frame in parse(data)]
@@ -78,6 +80,7 @@ def test_key_and_demand_hold_and_survive_a_restart(tmp_path: Path) -> None:
     kept = tmp_path / "signing.json"
     assert stat.S_IMODE(kept.stat().st_mode) == 0o600
     ground.vehicle.close()
+    carry_out(ground.vehicle)
 
     again = Signer(tmp_path, begin_us=5_000_000)
     assert again.all_signed()
@@ -117,6 +120,7 @@ def test_the_key_is_in_no_parameter_log_or_file_that_is_served(tmp_path: Path) -
     ground.set_up()
     ground.run(1.5)
     ground.vehicle.close()
+    carry_out(ground.vehicle)
     secret = bytes(range(32))
     served = [path for path in (tmp_path / "card").rglob("*") if path.is_file()]
     others = [path for path in tmp_path.iterdir() if path.is_file() and path.name != "signing.json"]

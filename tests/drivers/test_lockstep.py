@@ -242,8 +242,19 @@ def test_a_run_can_be_stopped_while_nothing_comes(end: str) -> None:
 
 
 def test_the_tap_flushes_once_a_second_of_simulated_time() -> None:
-    stamps: list[int] = []
-    tap = Tap(flush=stamps.append)
+    flushed: list[int] = []
+    now_us = 0
+    tap = Tap(flush=lambda: flushed.append(now_us))
     for now_us in range(0, 3_500_001, 250_000):
         tap.tick(now_us)
-    assert stamps == [1_000_000, 2_000_000, 3_000_000]
+    assert flushed == [1_000_000, 2_000_000, 3_000_000]
+
+
+def test_in_real_time_the_tap_flushes_by_whichever_clock_is_slower() -> None:
+    for speed, expected in ((0.5, [0.5, 1.0, 1.5]), (1.0, [0.5, 1.0, 1.5]), (10.0, [0.1 * k for k in range(1, 20)])):
+        flushed: list[float] = []
+        wall_us = 0
+        tap = Tap(flush=lambda: flushed.append(wall_us / 1e6))  # noqa: B023
+        for wall_us in range(0, 1_999_999, 4000):
+            tap.tick(round(wall_us * speed), wall_us)
+        assert flushed == pytest.approx(expected, abs=0.005 * len(expected))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,10 +9,12 @@ from typing import Any
 from mavsitl.codec import Counters
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector
+from mavsitl.keep import Work
 from mavsitl.link.settings import LinkName, Overlay
 from mavsitl.log.block import Array
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
+from mavsitl.services.files import Folder, Quota
 from mavsitl.signing import EPOCH_UNIX_US, Signing, SigningMode, SigningState
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot.autopilot import Autopilot
@@ -32,8 +33,6 @@ from mavsitl_vehicle.simulation import Simulation
 
 PLAN_SCHEMA = 1
 SIGNING_SCHEMA = 1
-SIGNING_STORE_US = 1_000_000
-"""So often the signing state is looked at; it is written when the time stamps near what was stored."""
 
 
 class Vehicle:
@@ -67,27 +66,33 @@ class Vehicle:
         self._lockstep = lockstep
         self._unix_us = unix_us
         self._notes: list[str] = []
-        """What was wrong with the stored state, for a STATUSTEXT at the first step."""
+        """What was wrong before there was an autopilot to say it."""
+        self._booted = False
         self.parameters = Parameters(
             *(Layer(name, values) for name, values in initial_links(flight.scenario).items()),
             Layer(f"airframe {flight.scenario.airframe}", flight.airframe.parameters),
             Layer(flight.name, flight.scenario.parameters),
             Layer("system id", {"MAV_SYS_ID": system_id}),
         )
-        parameter_store = keep_parameters(self.parameters, state, self._notes.append)
+        parameter_store = keep_parameters(self.parameters, state, self.warn)
         self.parameters.put("MAV_SYS_ID", system_id)  # what was kept does not outweigh what was asked for
-        plan_store = Store(state, "plan", PLAN_SCHEMA, self._notes.append)
-        self._stores = () if state is None else (parameter_store, plan_store)
+        plan_store = Store(state, "plan", PLAN_SCHEMA, self.warn)
         self.plan = VehiclePlan(
             report=lambda severity, text: self.autopilot.queue_text(severity, text),
-            changed=lambda mission_type: plan_store.put(lambda: json.loads(self.plan.to_json())),
+            changed=lambda mission_type: plan_store.put(self.plan.to_document),
         )
         self._load_plan(plan_store)
-        self._signing_store = Store(state, "signing", SIGNING_SCHEMA, self._notes.append, private=True)
+        self._signing_store = Store(state, "signing", SIGNING_SCHEMA, self.warn, private=True)
         self._signing = self._load_signing()
-        self._signing_us = 0
-        card = None if state is None else state / "card"
-        self._shared = Shared(self.parameters, self.plan, card=card, logs=logs, signing=self._signing, trusted=trusted)
+        self._signing_state = SigningState()
+        """What the signing store was given last."""
+        self._closed = False
+        self._stores = (parameter_store, plan_store, self._signing_store)
+        self._writing: dict[Work, Store] = {}
+        """Taken from the stores, and not known to be written yet."""
+        self._shared = Shared(
+            self.parameters, self.plan, card=self._card(state), logs=logs, signing=self._signing, trusted=trusted
+        )
         self.simulation = Simulation(flight, self.parameters, seed)
         self.autopilot = self._boot(0)
         self.links = LinkControl(self.parameters, flight.scenario, lockstep=lockstep)
@@ -104,7 +109,7 @@ class Vehicle:
         content = store.load()
         if content:
             try:
-                self.plan.load_json(json.dumps(content))
+                self.plan.load_document(content)
             except PlanError as error:
                 store.set_aside(str(error))
 
@@ -122,11 +127,52 @@ class Vehicle:
         signing.policy.mode = SigningMode(int(self.parameters["MAV_SIGN_CFG"]))
         return signing
 
+    def _card(self, state: Path | None) -> Folder | None:
+        """The memory card; None without a state folder, or where that cannot be used."""
+        if state is None:
+            return None
+        try:
+            return Folder(state / "card", Quota(), settles_later=True)
+        except OSError as error:
+            self.warn(f"{state / 'card'}: no memory card: {error.strerror or error}")
+            return None
+
+    def warn(self, text: str) -> None:
+        """A warning for whoever flies it: a STATUSTEXT on every link."""
+        if self._booted:
+            self.autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, text)
+        else:
+            self._notes.append(text)
+
+    def unsaved(self, now_us: int) -> list[Work]:
+        """What has to be on the disk soon. `now_us` is wall time. See `mavsitl.keep.Keeping`."""
+        if self._signing is not None and not self._closed:
+            self._keep_signing(self._signing.unsaved())
+        work: list[Work] = []
+        for store in self._stores:
+            document = store.take(now_us)
+            if document is not None:
+                self._writing[document] = store
+                work.append(document)
+        if self._shared.card is not None:
+            work += self._shared.card.unsettled()
+        return work
+
+    def saved(self, work: Work, error: OSError | None, now_us: int) -> None:
+        """What became of what `unsaved` gave."""
+        store = self._writing.pop(work, None)
+        if store is None:
+            if error is not None:
+                self.warn(f"memory card: {error.strerror or error}")
+            return
+        store.written(error, now_us)
+        if store is self._signing_store and self._signing is not None and error is None:
+            self._signing.saved(self._signing_state)
+
     def _keep_signing(self, state: SigningState | None) -> None:
-        if self._signing is not None and state is not None:
+        if state is not None:
+            self._signing_state = state
             self._signing_store.put({"state": state.to_bytes().hex()})
-            if self._signing_store.flush():
-                self._signing.saved(state)
 
     def _boot(self, now_us: int) -> Autopilot:
         """An autopilot whose clock begins at `now_us` of the driver's."""
@@ -145,6 +191,7 @@ class Vehicle:
         for note in self._notes:
             autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, note)
         self._notes.clear()
+        self._booted = True
         return autopilot
 
     def continue_from(self, sequence: int) -> None:
@@ -221,25 +268,19 @@ class Vehicle:
         autopilot.observe(now_us)
         autopilot.report(now_us)
         self._record.write(self._now_us, self)
-        for store in self._stores:
-            store.step(self._now_us)
         if self._signing is not None:
             self._signing.policy.locked = autopilot.commander.armed
-            if self._now_us - self._signing_us >= SIGNING_STORE_US:
-                self._signing_us = self._now_us
-                self._keep_signing(self._signing.unsaved())
         if autopilot.land.released_us is not None and not autopilot.commander.armed:
             self._done = True
             self._after_flight()
 
     def close(self) -> None:
-        """Write what is not written yet and close the files that clients had open."""
-        for store in self._stores:
-            store.close()
-        if self._signing is not None and self._signing.has_key:
-            self._keep_signing(self._signing.closing_state())
+        """Close the files that clients had open. What is `unsaved` afterwards is the last there is to write."""
         for port in self.autopilot.ports:
             port.close()
+        if self._signing is not None and (self._signing.has_key or self._signing.unsaved() is not None):
+            self._keep_signing(self._signing.closing_state())
+        self._closed = True
 
     def _after_flight(self) -> None:
         """Ready for the next: where the flight began in a clamp, the clamp takes the vehicle back."""

@@ -7,7 +7,6 @@ altitudes above mean sea level. `MissionProgress` is where the vehicle is, an im
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -72,12 +71,12 @@ __all__ = [
     "check_mission_item",
     "feasibility",
     "following",
-    "from_json",
+    "from_document",
     "jump_to",
     "rally_points",
     "settle",
     "takeoff_before",
-    "to_json",
+    "to_document",
     "validate_plan",
 ]
 
@@ -740,23 +739,16 @@ class PlanError(ValueError):
     """A stored plan that cannot be used; the text says why."""
 
 
-_VERSION = 1
 _KEYS = {MISSION: "mission", FENCE: "fence", RALLY: "rally"}
 _FLOATS = ("param1", "param2", "param3", "param4", "z")
 
 
-def to_json(plans: Mapping[int, Sequence[MissionItem]], seq: int = 0) -> str:
-    """The three plans and the current item as JSON text; NaN is written as null."""
-    document: dict[str, Any] = {"version": _VERSION, "current": seq}
+def to_document(plans: Mapping[int, Sequence[MissionItem]], seq: int = 0) -> dict[str, Any]:
+    """The three plans and the current item as what JSON is made of, but for NaN, which a file has as null."""
+    document: dict[str, Any] = {"current": seq}
     for mission_type, key in _KEYS.items():
-        document[key] = [
-            {
-                name: None if name in _FLOATS and isnan(value) else value
-                for name, value in zip(MissionItem._fields, item, strict=True)
-            }
-            for item in plans.get(mission_type, ())
-        ]
-    return json.dumps(document, allow_nan=False, indent=1)
+        document[key] = [item._asdict() for item in plans.get(mission_type, ())]
+    return document
 
 
 def _read_item(where: str, entry: object) -> MissionItem:
@@ -786,18 +778,14 @@ def _read_item(where: str, entry: object) -> MissionItem:
     return item
 
 
-def from_json(text: str, limits: Mapping[int, int] = DEFAULT_LIMITS) -> tuple[dict[int, tuple[MissionItem, ...]], int]:
+def from_document(
+    document: Mapping[str, object], limits: Mapping[int, int] = DEFAULT_LIMITS
+) -> tuple[dict[int, tuple[MissionItem, ...]], int]:
     """The plans by mission type, and the current item, checked as an upload is.
 
     Raises:
-        PlanError: the text is no such document, or a plan in it would be refused as an upload.
+        PlanError: it is no such document, or a plan in it would be refused as an upload.
     """
-    try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise PlanError(f"no JSON: {error}") from None
-    if not isinstance(document, dict) or document.get("version") != _VERSION:
-        raise PlanError(f"no plan of version {_VERSION}")
     plans: dict[int, tuple[MissionItem, ...]] = {}
     for mission_type, key in _KEYS.items():
         entries = document.get(key)
@@ -947,14 +935,14 @@ class VehiclePlan:
         seq = following(self._mission, self.progress)
         return None if seq is None else action(self._mission[seq], home_altitude_amsl_m, takeoff_height_m)
 
-    def to_json(self) -> str:
-        """See `to_json`."""
+    def to_document(self) -> dict[str, Any]:
+        """See `to_document`."""
         plans = {mission_type: self.stores.items(mission_type) for mission_type in _KEYS}
-        return to_json(plans, self.progress.seq)
+        return to_document(plans, self.progress.seq)
 
-    def load_json(self, text: str) -> None:
+    def load_document(self, document: Mapping[str, object]) -> None:
         """Put stored plans into force. Raises `PlanError`, and then nothing has changed."""
-        plans, seq = from_json(text, self.stores.limits)
+        plans, seq = from_document(document, self.stores.limits)
         for mission_type, items in plans.items():
             self.stores.replace(mission_type, items, seq if mission_type == MISSION else 0)
 

@@ -12,7 +12,7 @@ from mavsitl.node import Node
 from mavsitl.services.base import Peer, Service
 from mavsitl.services.bucket import TokenBucket
 from mavsitl.services.command import Command, CommandServer
-from mavsitl.services.files import FileTree, Folder, MemoryFiles, Mounts, Quota
+from mavsitl.services.files import FileTree, Folder, MemoryFiles, Mounts
 from mavsitl.services.ftp import FtpServer
 from mavsitl.services.log_transfer import LogServer, TreeLogs
 from mavsitl.services.mission import MissionServer
@@ -47,12 +47,13 @@ class Shared:
         parameters: Parameters,
         plan: VehiclePlan,
         *,
-        card: Path | None = None,
+        card: Folder | None = None,
         logs: Path | None = None,
         signing: Signing | None = None,
         trusted: bool = True,
     ) -> None:
-        """`card`: a folder that MAVLink FTP may write to; `logs`: where the logs are; None: there is none."""
+        """`card`: what MAVLink FTP may write to; `logs`: where the logs are; None: there is none."""
+        self.card = card
         self.parameters = parameters
         self.plan = plan
         self.signing = signing
@@ -61,7 +62,7 @@ class Shared:
         extras = {name: _extra(f"{metadata.FOLDER}/{name}") for name in names}
         mounts: dict[str, FileTree] = {metadata.FOLDER: MemoryFiles(extras)}
         if card is not None:
-            mounts[SANDBOX] = Folder(card, Quota())
+            mounts[SANDBOX] = card
         log_tree: FileTree = MemoryFiles({})
         if logs is not None:
             log_tree = mounts[LOGS] = Folder(logs)

@@ -2,32 +2,39 @@
 
 from __future__ import annotations
 
-import json
+import errno
 import os
+import stat
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from itertools import count
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+import msgspec
+
+from mavsitl.keep import Document
 from mavsitl_vehicle.autopilot.parameters import Parameters
 
 MAX_BYTES = 4 << 20
 """A longer file is not one of ours."""
+
+MAX_ASIDE = 9
+"""Damaged files of one name that are kept; the last gives way to the next."""
+
+_NO_WAIT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
 
 Report = Callable[[str], None]
 """Takes one line for the user."""
 
 
 class Store:
-    """One JSON object in one file, written behind: `put` it, `step` with the time, `close` at the end.
+    """One JSON object in one file: `load` it at the start, `put` what it shall be, `take` what is to be written.
 
-    A file that cannot be understood is moved aside as ``<name>.bad`` and the vehicle starts without it. A file that
-    cannot be written is reported once and tried again; nothing here raises on what the disk does. With `folder` None
-    nothing is read or written.
+    A file that cannot be read or understood is moved aside as ``<name>.bad`` (then ``.bad-2`` and so on) and the
+    vehicle starts without it. A file that cannot be written is reported once and tried again; nothing here raises on
+    what the disk does. With `folder` None nothing is read or written. Times are of the wall clock.
     """
 
-    WRITE_DELAY_US = 200_000
-    """From a change to the file, in simulated time: what changes meanwhile is written at once."""
     RETRY_DELAY_US = 5_000_000
 
     def __init__(self, folder: Path | None, name: str, schema: int, report: Report, *, private: bool = False) -> None:
@@ -36,9 +43,9 @@ class Store:
         self._schema = schema
         self._report = report
         self._mode = 0o600 if private else 0o644
-        self._pending: Mapping[str, Any] | Callable[[], Mapping[str, Any]] | None = None
-        self._due_us: int | None = None
-        """When to write; None: at the first step that sees the change."""
+        self._content: Mapping[str, Any] | Callable[[], Mapping[str, Any]] = {}
+        self._changed = False
+        self._retry_us = 0
         self._failing = False
 
     def load(self) -> dict[str, Any]:
@@ -46,23 +53,19 @@ class Store:
         if self.path is None:
             return {}
         try:
-            with self.path.open("rb") as file:
-                data = file.read(MAX_BYTES + 1)
+            return self._parse(_read(self.path))
         except FileNotFoundError:
             return {}
         except OSError as error:
-            self._report(f"{self.path}: cannot be read, the defaults hold: {error.strerror or error}")
-            return {}
-        try:
-            return self._parse(data)
+            self.set_aside(f"cannot be read: {error.strerror or error}")
         except (ValueError, RecursionError) as error:
-            self.set_aside(str(error) or "nested too deeply")
-            return {}
+            self.set_aside(str(error))
+        return {}
 
     def _parse(self, data: bytes) -> dict[str, Any]:
         if len(data) > MAX_BYTES:
             raise ValueError(f"longer than {MAX_BYTES} bytes")
-        document = json.loads(data.decode("utf-8"), parse_constant=_no_constant)
+        document = msgspec.json.decode(data)
         if not isinstance(document, dict) or not isinstance(document.get("content"), dict):
             raise ValueError("not a file of this vehicle")
         if document.get("schema") != self._schema:
@@ -71,10 +74,11 @@ class Store:
         return content
 
     def set_aside(self, reason: str) -> None:
+        """Whatever is in the file's place gets another name, so that it can be looked at and is not written over."""
         assert self.path is not None
-        aside = self.path.with_name(f"{self.path.name}.bad")
+        aside = _free_name(self.path)
         try:
-            self.path.replace(aside)
+            self.path.rename(aside)
         except OSError as error:
             kept = f"cannot be moved aside: {error.strerror or error}"
         else:
@@ -82,73 +86,56 @@ class Store:
         self._report(f"{self.path}: damaged ({reason}), the defaults hold; {kept}")
 
     def put(self, content: Mapping[str, Any] | Callable[[], Mapping[str, Any]]) -> None:
-        """What the file shall hold from now on: JSON that does not change afterwards, or what makes it at the time."""
-        if self.path is not None:
-            self._pending = content
+        """What the file shall hold from now on: JSON, or what makes it when it is taken. NaN is kept as null."""
+        self._content = content
+        self._changed = self.path is not None
 
-    def step(self, now_us: int) -> None:
-        """Write what is due. A change is on the disk within `WRITE_DELAY_US` and one step."""
-        if self._pending is None:
+    def take(self, now_us: int) -> Document | None:
+        """What is to be written, once; None where nothing has changed, or writing failed a moment ago."""
+        if not self._changed or self.path is None or now_us < self._retry_us:
+            return None
+        self._changed = False
+        content = self._content() if callable(self._content) else self._content
+        text = msgspec.json.encode({"schema": self._schema, "content": content}, order="sorted")
+        return Document(self.path, msgspec.json.format(text, indent=1) + b"\n", self._mode)
+
+    def written(self, error: OSError | None, now_us: int) -> None:
+        """What became of what was taken."""
+        if error is None:
+            self._failing = False
             return
-        if self._due_us is None:
-            self._due_us = now_us + self.WRITE_DELAY_US
-        elif now_us >= self._due_us:
-            self._due_us = None if self.flush() else now_us + self.RETRY_DELAY_US
-
-    def flush(self) -> bool:
-        """Write now what is not written yet. False where that fails; it stays to be written."""
-        if self._pending is None or self.path is None:
-            return True
-        content = self._pending() if callable(self._pending) else self._pending
-        document = {"schema": self._schema, "content": content}
-        data = (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode("utf-8")
-        try:
-            _write(self.path, data, self._mode)
-        except OSError as error:
-            if not self._failing:
-                self._report(f"{self.path}: cannot be written: {error.strerror or error}")
+        self._changed = True
+        self._retry_us = now_us + self.RETRY_DELAY_US
+        if not self._failing:
             self._failing = True
-            return False
-        self._failing = False
-        self._pending = None
-        return True
-
-    def close(self) -> None:
-        """Write what is left."""
-        self.flush()
-        self._due_us = None
+            self._report(f"{self.path}: cannot be written: {error.strerror or error}")
 
 
-def _no_constant(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not JSON")
+def _read(path: Path) -> bytes:
+    """At most one byte more than allowed of a plain file, symbolic links followed; never waits, as on a pipe it would.
+
+    Raises `OSError`.
+    """
+    descriptor = os.open(path, os.O_RDONLY | _NO_WAIT)
+    with os.fdopen(descriptor, "rb") as file:
+        kind = os.fstat(descriptor).st_mode
+        if not stat.S_ISREG(kind):
+            raise OSError(errno.EISDIR if stat.S_ISDIR(kind) else errno.EINVAL, "not a plain file")
+        return file.read(MAX_BYTES + 1)
 
 
-def _write(path: Path, data: bytes, mode: int) -> None:
-    """Replace `path` in one move: whoever reads it, and whenever the power goes, finds the old or the new bytes."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    with suppress(FileNotFoundError):
-        temporary.unlink()  # of a process that was killed; its mode may be another
-    # A file that is there again by now is not ours to write: O_EXCL follows no link either.
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), mode)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-    if hasattr(os, "O_DIRECTORY"):  # the move itself is on the disk only with its folder
-        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            with suppress(OSError):  # some file systems cannot; the file is whole there too
-                os.fsync(folder)
-        finally:
-            os.close(folder)
+def _free_name(path: Path) -> Path:
+    for number in count(1):
+        aside = path.with_name(f"{path.name}.bad" if number == 1 else f"{path.name}.bad-{number}")
+        if number == MAX_ASIDE or not os.path.lexists(aside):
+            return aside
+    raise AssertionError("counted to the end")
 
 
 def keep_parameters(parameters: Parameters, folder: Path | None, report: Report) -> Store:
     """Read the parameters that were set in an earlier run, and keep those that are set from now on.
 
-    The file holds what differs from the defaults of airframe and scenario. The caller steps and closes the store.
+    The file holds what differs from the defaults of airframe and scenario. The caller takes from the store.
     """
     store = Store(folder, "parameters", 1, report)
     texts = parameters.restore(store.load())
@@ -156,7 +143,7 @@ def keep_parameters(parameters: Parameters, folder: Path | None, report: Report)
         report(f"{store.path}: left out: {text}")
     if len(texts) > MAX_TEXTS:
         report(f"{store.path}: left out: {len(texts) - MAX_TEXTS} more")
-    parameters.subscribe(lambda name, value: store.put(parameters.changed()))
+    parameters.subscribe(lambda name, value: store.put(parameters.changed))
     return store
 
 
