@@ -591,7 +591,7 @@ class _Status:
             self._print({
                 "event": "end", "simulated_s": outcome.simulated_s, "wall_s": outcome.wall_s, "speed": outcome.speed,
                 "wire_hash": outcome.wire_hash, "finished": outcome.finished,
-                "frames": outcome.frames, "rejected": outcome.rejected,
+                "frames": outcome.frames, "rejected": outcome.rejected, "dropped": outcome.dropped,
                 **({} if outcome.link is None else {"link": outcome.link}),
             })  # fmt: skip
             return
@@ -599,8 +599,8 @@ class _Status:
             f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time; "
             f"{outcome.frames} frames in"
         )
-        if outcome.rejected:
-            print(f"{outcome.rejected} bad frames were dropped")
+        if outcome.dropped:
+            print("dropped: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
         for direction, counts in (outcome.link or {}).items():
             print(f"link {direction}: " + ", ".join(f"{name} {value:g}" for name, value in counts.items() if value))
         if outcome.lateness_us is not None:

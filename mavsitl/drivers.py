@@ -13,12 +13,14 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from mavsitl.clock import LatenessHistogram, PacedClock, monotonic_us
-from mavsitl.link.base import Link, LinkError, LinkSilent
+from mavsitl.link.base import Link, LinkError, LinkSilent, Source
+from mavsitl.link.budget import Excess, InputBudget
 from mavsitl.link.exchange import EXCHANGE_BYTES, HELLO, pack, unpack
 from mavsitl.link.sockets import wait_any
 from mavsitl.link.udp import ConnectedUdp
@@ -43,7 +45,9 @@ CHECK_WAIT_S, NO_SOCKET_WAIT_S = 0.02, 0.002
 """Of a check: longest wait for a datagram; and a pause where there is nothing to wait for, a server not there yet."""
 
 TAKEN = 16
-"""Real time: datagrams taken from a link at a time, at most. With more it is first seen whether the tick is due."""
+"""Real time: datagrams of a link handed over at a time, at most. With more it is first seen whether the tick is due."""
+READ = 256
+"""Real time: datagrams read from a link at a time, at most: so many a tick are 60,000 a second."""
 WAKES = 32
 """Real time: times within a tick that something may wake the vehicle; from then on it waits for the tick."""
 WAKE_S = 60e-6
@@ -78,6 +82,9 @@ class VehicleCore(Core, Protocol):
 class RealTimeVehicleCore(VehicleCore, Protocol):
     def receive(self, port: int, datagram: bytes, at_us: int | None = None) -> int:
         """`at_us`: when it came, from the last tick to just before the next; None: at the tick."""
+
+    def refuse(self, port: int, excess: Excess) -> None:
+        """A datagram for `port` was dropped unread; only counted."""
 
 
 class GroundCore(Core, Protocol):
@@ -471,6 +478,48 @@ class RealTime:
     """How often the run was more than a second late and the schedule was moved; simulated time never jumps."""
 
 
+class Intake:
+    """What comes to a vehicle in real time: each source within its budget, and only so much of it at a time.
+
+    A datagram beyond its budget is dropped unread; `vehicle.refuse` counts it.
+    """
+
+    def __init__(self, vehicle: RealTimeVehicleCore, links: Sequence[Link], tap: Tap) -> None:
+        self._vehicle = vehicle
+        self._links = links
+        self._tap = tap
+        self._budgets = [InputBudget() for _ in links]
+        self._queues: list[deque[tuple[bytes, Source]]] = [deque() for _ in links]
+
+    @property
+    def waiting(self) -> bool:
+        """Something was read and not handed over yet."""
+        return any(self._queues)
+
+    def take(self, now_us: int, wall_us: int, at_us: Callable[[], int]) -> None:
+        """Read what has come and hand over up to `TAKEN` datagrams of each link.
+
+        `now_us` is the last tick, `wall_us` any clock on which peers expire and budgets grow, whatever the simulated
+        one does, and `at_us()` what the vehicle's clock shows.
+        """
+        vehicle = self._vehicle
+        for port, link in enumerate(self._links):
+            budget, queue = self._budgets[port], self._queues[port]
+            if len(queue) < READ:
+                for datagram, source in link.receive(wall_us, READ):
+                    excess = budget.take(source, wall_us)
+                    if excess is None:
+                        queue.append((datagram, source))
+                    else:
+                        vehicle.refuse(port, excess)
+            for _ in range(min(TAKEN, len(queue))):
+                datagram, source = queue.popleft()
+                if port == 0:
+                    self._tap.hear(Direction.FROM_GROUND, now_us, datagram)
+                if vehicle.receive(port, datagram, at_us()) and link.admit(source, wall_us):
+                    budget.peer(source)
+
+
 def run_realtime_vehicle(
     vehicle: RealTimeVehicleCore,
     links: Sequence[Link],
@@ -500,14 +549,10 @@ def run_realtime_vehicle(
                     tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
                 link.send(datagram)
 
+    intake = Intake(vehicle, links, tap)
+
     def take() -> None:
-        for port, link in enumerate(links):
-            wall_us = monotonic_us()  # peers expire on the wall clock, whatever the simulated one does
-            for datagram, source in link.receive(wall_us, TAKEN):
-                if port == 0:
-                    tap.hear(Direction.FROM_GROUND, now_us, datagram)
-                if vehicle.receive(port, datagram, clock.time_us()):
-                    link.admit(source, wall_us)
+        intake.take(now_us, monotonic_us(), clock.time_us)
 
     while not stop() and not (until_finished and vehicle.finished):
         vehicle.step(now_us)
@@ -515,7 +560,9 @@ def run_realtime_vehicle(
         next_us = now_us + vehicle.period_us
         for _ in range(WAKES):
             spare_s = clock.spare_s(next_us)
-            if spare_s <= GUARD_S or not wait(links, spare_s - WAKE_S) or clock.spare_s(next_us) <= GUARD_S:
+            if spare_s <= GUARD_S:
+                break
+            if not intake.waiting and (not wait(links, spare_s - WAKE_S) or clock.spare_s(next_us) <= GUARD_S):
                 break
             take()
             send()

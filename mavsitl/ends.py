@@ -6,7 +6,7 @@ import errno
 import ipaddress
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -52,6 +52,8 @@ class Outcome:
     lateness_us: tuple[float, float] | None = None
     """p50 and p99 of the tick's lateness; real time only."""
     rebased: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+    """Input that was not acted on, by reason, where there was any: see `mavsitl.codec.Counters`."""
     link: dict[str, dict[str, float]] | None = None
     """Of an impaired link, by direction: `mavsitl.link.impaired.Statistics`; None of a perfect one, and the ground."""
 
@@ -396,6 +398,10 @@ def _open_ear(address: Address) -> tuple[Ear, Link | None]:
     return Ear(endpoint=str(address), speaks_first=speaks_first), link
 
 
+_KEPT = ("frames", "skipped_bytes")
+"""The counters that are not numbers of what was dropped."""
+
+
 class _Watch:
     """Wall time of a run, from the first exchange: start-up and waiting for the other side do not count."""
 
@@ -423,6 +429,7 @@ class _Watch:
             finished=self._core.succeeded,
             frames=counters.frames,
             rejected=counters.rejected,
+            dropped={name: count for name, count in asdict(counters).items() if count and name not in _KEPT},
             lateness_us=lateness_us,
             rebased=rebased,
             link=None if channels is None else channels.statistics(),
