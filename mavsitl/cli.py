@@ -776,9 +776,8 @@ class _Status:
             f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time; "
             f"{outcome.frames} frames in"
         )
-        if outcome.rejected:
-            print(f"{outcome.rejected} bad frames were dropped")
-            print("  by reason: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
+        if outcome.dropped:
+            print("dropped: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
         for place, directions in outcome.links.items():
             for direction, counts in directions.items():
                 shown = ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)

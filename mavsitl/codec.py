@@ -118,6 +118,12 @@ class Counters:
     """bytes that belong to no good frame"""
     unsupported: int = 0
     """good frames that no service handles; counted by whoever dispatches them, not here"""
+    errors: int = 0
+    """good frames whose handler failed, which is a bug of ours; counted as `unsupported` is"""
+    over_budget: int = 0
+    """datagrams dropped unread because their source had used up its input budget; counted by whoever reads them"""
+    crowded: int = 0
+    """the same, for the budget of all sources together that are no peers"""
 
     def __add__(self, other: Counters) -> Counters:
         return Counters(*map(add, astuple(self), astuple(other)))

@@ -13,13 +13,15 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from mavsitl.clock import CATCH_UP_US, LatenessHistogram, PacedClock, monotonic_us
 from mavsitl.keep import Keeper, Keeping
-from mavsitl.link.base import Link, LinkError, LinkSilent
+from mavsitl.link.base import Link, LinkError, LinkSilent, Source
+from mavsitl.link.budget import Excess, InputBudget
 from mavsitl.link.exchange import EXCHANGE_BYTES, HELLO, pack, unpack
 from mavsitl.link.sockets import wait_any
 from mavsitl.link.udp import ConnectedUdp
@@ -50,7 +52,9 @@ CHECK_WAIT_S, NO_SOCKET_WAIT_S = 0.02, 0.002
 """Of a check: longest wait for a datagram; and a pause where there is nothing to wait for, a server not there yet."""
 
 TAKEN = 16
-"""Real time: datagrams taken from a link at a time, at most. With more it is first seen whether the tick is due."""
+"""Real time: datagrams of a link handed over at a time, at most. With more it is first seen whether the tick is due."""
+READ = 256
+"""Real time: datagrams read from a link at a time, at most: so many a tick are 60,000 a second."""
 WAKES = 32
 """Real time: times within a tick that something may wake the vehicle; from then on it waits for the tick."""
 WAKE_S = 60e-6
@@ -91,6 +95,9 @@ class RealTimeVehicleCore(VehicleCore, Keeping, Protocol):
 
     def close(self) -> None:
         """The end: after it there may be something `unsaved` once more, and nothing after that."""
+
+    def refuse(self, port: int, excess: Excess) -> None:
+        """A datagram for `port` was dropped unread; only counted."""
 
 
 class GroundCore(Core, Protocol):
@@ -493,6 +500,48 @@ class RealTime:
     """Wall time that was given up by that."""
 
 
+class Intake:
+    """What comes to a vehicle in real time: each source within its budget, and only so much of it at a time.
+
+    A datagram beyond its budget is dropped unread; `vehicle.refuse` counts it.
+    """
+
+    def __init__(self, vehicle: RealTimeVehicleCore, links: Sequence[Link], tap: Tap) -> None:
+        self._vehicle = vehicle
+        self._links = links
+        self._tap = tap
+        self._budgets = [InputBudget() for _ in links]
+        self._queues: list[deque[tuple[bytes, Source]]] = [deque() for _ in links]
+
+    @property
+    def waiting(self) -> bool:
+        """Something was read and not handed over yet."""
+        return any(self._queues)
+
+    def take(self, now_us: int, wall_us: int, at_us: Callable[[], int]) -> None:
+        """Read what has come and hand over up to `TAKEN` datagrams of each link.
+
+        `now_us` is the last tick, `wall_us` any clock on which peers expire and budgets grow, whatever the simulated
+        one does, and `at_us()` what the vehicle's clock shows.
+        """
+        vehicle = self._vehicle
+        for port, link in enumerate(self._links):
+            budget, queue = self._budgets[port], self._queues[port]
+            if len(queue) < READ:
+                for datagram, source in link.receive(wall_us, READ):
+                    excess = budget.take(source, wall_us)
+                    if excess is None:
+                        queue.append((datagram, source))
+                    else:
+                        vehicle.refuse(port, excess)
+            for _ in range(min(TAKEN, len(queue))):
+                datagram, source = queue.popleft()
+                if port == 0:
+                    self._tap.hear(Direction.FROM_GROUND, now_us, datagram)
+                if vehicle.receive(port, datagram, at_us()) and link.admit(source, wall_us):
+                    budget.peer(source)
+
+
 def run_realtime_vehicle(
     vehicle: RealTimeVehicleCore,
     links: Sequence[Link],
@@ -533,14 +582,10 @@ def run_realtime_vehicle(
                     tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
                 link.send(datagram)
 
+    intake = Intake(vehicle, links, tap)
+
     def take() -> None:
-        for port, link in enumerate(links):
-            wall_us = monotonic_us()  # peers expire on the wall clock, whatever the simulated one does
-            for datagram, source in link.receive(wall_us, TAKEN):
-                if port == 0:
-                    tap.hear(Direction.FROM_GROUND, now_us, datagram)
-                if vehicle.receive(port, datagram, clock.time_us()):
-                    link.admit(source, wall_us)
+        intake.take(now_us, monotonic_us(), clock.time_us)
 
     try:
         while not stop() and not (until_finished and vehicle.finished):
@@ -551,10 +596,11 @@ def run_realtime_vehicle(
                 spare_s = clock.spare_s(next_us)
                 if spare_s <= GUARD_S:
                     break
-                limit_s, soon_s = spare_s - WAKE_S, due_s()
-                came = wait(links, min(limit_s, soon_s)) or soon_s < limit_s
-                if not came or clock.spare_s(next_us) <= GUARD_S:
-                    break
+                if not intake.waiting:
+                    limit_s, soon_s = spare_s - WAKE_S, due_s()
+                    came = wait(links, min(limit_s, soon_s)) or soon_s < limit_s
+                    if not came or clock.spare_s(next_us) <= GUARD_S:
+                        break
                 take()
                 send()
             clock.wait_until(next_us)

@@ -523,6 +523,10 @@ def _open_ear(address: Address) -> tuple[Ear, Link | None]:
     return Ear(endpoint=str(address), speaks_first=speaks_first), link
 
 
+_KEPT = ("frames", "skipped_bytes")
+"""The counters that are not numbers of what was dropped."""
+
+
 class _Watch:
     """Wall time of a run, from the first exchange: start-up and waiting for the other side do not count."""
 
@@ -560,5 +564,5 @@ class _Watch:
             rebased=0 if timing is None else timing.rebased,
             lost_s=0.0 if timing is None else timing.lost_us / 1e6,
             links=links or {},
-            dropped={name: count for name, count in dropped.items() if count and name != "frames"},
+            dropped={name: count for name, count in dropped.items() if count and name not in _KEPT},
         )

@@ -20,7 +20,21 @@ MAX_PEERS = 8
 PEER_SILENCE_US = 10_000_000
 """A peer that has sent nothing valid for so long is fed no more."""
 
+NEWCOMER_BYTES = 16_384
+"""A new peer is sent no more than this until it speaks again: one forged datagram brings its victim no more."""
+
 _READ_BYTES = MAX_DATAGRAM_BYTES + 1  # one more than the parser takes: a cut datagram is still seen to be too long
+
+
+class _Peer:
+    """A source that is fed."""
+
+    __slots__ = ("allowance", "heard_us")
+
+    def __init__(self, now_us: int) -> None:
+        self.heard_us = now_us
+        self.allowance: int | None = NEWCOMER_BYTES
+        """Bytes that may still be sent before it speaks again; None: it has, and there is no limit."""
 
 
 class UdpLink:
@@ -35,6 +49,7 @@ class UdpLink:
         refused: sends that met no listener, where the system reports them (Linux does not for a socket of this kind).
         send_errors: datagrams not sent to one receiver because the system refused them (buffers full, no route).
         peers_rejected: admissions refused because every place was taken.
+        withheld: datagrams not sent to a new peer that has not spoken again.
     """
 
     def __init__(
@@ -62,7 +77,8 @@ class UdpLink:
         self.peers_rejected = 0
         self._max_peers = max_peers
         self._peer_silence_us = peer_silence_us
-        self._peers: dict[Source, int] = {}
+        self.withheld = 0
+        self._peers: dict[Source, _Peer] = {}
         self._closed = False
 
     @property
@@ -110,20 +126,29 @@ class UdpLink:
         self._check_open()
         if self.remote is not None:
             self._send_to(datagram, self.remote)
-        for peer in self._peers:
-            self._send_to(datagram, peer)
+        for source, peer in self._peers.items():
+            if peer.allowance is not None:
+                if peer.allowance < len(datagram):
+                    self.withheld += 1
+                    continue
+                peer.allowance -= len(datagram)
+            self._send_to(datagram, source)
 
     def admit(self, source: Source, now_us: int) -> bool:
         """Feed `source` until it has been silent too long; whether there was a place for it."""
         self._check_open()
         if source == self.remote:
             return True
-        if source not in self._peers:
+        peer = self._peers.get(source)
+        if peer is None:
             self._expire(now_us)
             if len(self._peers) >= self._max_peers:
                 self.peers_rejected += 1
                 return False
-        self._peers[source] = now_us
+            self._peers[source] = _Peer(now_us)
+        elif now_us > peer.heard_us:  # not the rest of what came at once
+            peer.heard_us = now_us
+            peer.allowance = None
         return True
 
     def close(self) -> None:
@@ -147,9 +172,9 @@ class UdpLink:
             self.send_errors += 1
 
     def _expire(self, now_us: int) -> None:
-        silent = [peer for peer, heard_us in self._peers.items() if now_us - heard_us > self._peer_silence_us]
-        for peer in silent:
-            del self._peers[peer]
+        silent = [source for source, peer in self._peers.items() if now_us - peer.heard_us > self._peer_silence_us]
+        for source in silent:
+            del self._peers[source]
 
     def _check_open(self) -> None:
         if self._closed:

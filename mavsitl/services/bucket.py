@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-__all__ = ["TokenBucket"]
+from collections import OrderedDict
+
+from mavsitl.services.base import Peer
+
+__all__ = ["FairBuckets", "TokenBucket"]
 
 
 class TokenBucket:
@@ -28,3 +32,32 @@ class TokenBucket:
             return False
         self._credit -= tokens * 1e6
         return True
+
+
+class FairBuckets:
+    """A `TokenBucket` for each sender, so that one that asks too much is refused and the others are not.
+
+    At most `MAX_SENDERS` are told apart, and all together may ask `SHARES` times as much as one.
+    """
+
+    MAX_SENDERS = 16
+    SHARES = 4.0
+
+    __slots__ = ("_all", "_buckets", "_burst", "_rate_hz")
+
+    def __init__(self, rate_hz: float, burst: float) -> None:
+        """Of one sender. Raises as `TokenBucket`."""
+        self._rate_hz = rate_hz
+        self._burst = burst
+        self._all = TokenBucket(self.SHARES * rate_hz, self.SHARES * burst)
+        self._buckets: OrderedDict[Peer, TokenBucket] = OrderedDict()
+
+    def take(self, sender: Peer, now_us: int) -> bool:
+        """Whether `sender` had a token, and all together one."""
+        bucket = self._buckets.get(sender)
+        if bucket is None:
+            if len(self._buckets) >= self.MAX_SENDERS:
+                self._buckets.popitem(last=False)
+            bucket = self._buckets[sender] = TokenBucket(self._rate_hz, self._burst)
+        self._buckets.move_to_end(sender)
+        return bucket.take(now_us) and self._all.take(now_us)

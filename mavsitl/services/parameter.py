@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
 from mavsitl.dialect import mavlink
 from mavsitl.services.base import NOTHING, Message, Peer
+from mavsitl.services.bucket import FairBuckets
 
 __all__ = [
     "HASH_CHECK",
@@ -166,9 +167,8 @@ class ParameterServer:
     """Between two values of a list: more than 400 a second are lost by MAVProxy."""
     CATCH_UP_US = 50_000
     """What a `step` that comes late sends at most at once: the values of this time."""
-    ANSWER_INTERVAL_US = 1_000
-    ANSWER_BURST_US = 200_000
-    """Answers to single requests: at most 1000 a second after a burst of 200. The rest goes unanswered."""
+    ANSWERS_HZ, ANSWERS_BURST = 1000.0, 200.0
+    """Answers to single requests of one asker. The rest goes unanswered."""
     REPORT_INTERVAL_US = 1_000_000
 
     def __init__(self, table: ParameterTable, report: Callable[[str], None] | None = None) -> None:
@@ -178,12 +178,14 @@ class ParameterServer:
         self._reported_us: int | None = None
         self._next: int | None = None
         """Index of the list's next value; None: no list is being sent."""
+        self._left = 0
+        """Values of the list still to send."""
         self._hash_first = False
         self._changed: dict[str, None] = {}
         """Names of values to tell on this link, oldest first."""
         self._setting: str | None = None
         self._due_us = 0
-        self._answer_us = 0
+        self._answers = FairBuckets(self.ANSWERS_HZ, self.ANSWERS_BURST)
         self.dropped = 0
         """Requests that went unanswered because there were too many."""
         self._handlers: dict[int, Callable[[Message, Peer, int], Sequence[Message]]] = {
@@ -199,11 +201,9 @@ class ParameterServer:
         handler = self._handlers.get(type(message).id)
         if handler is None:
             return NOTHING
-        if handler != self._on_list:
-            if self._answer_us > now_us + self.ANSWER_BURST_US:
-                self.dropped += 1
-                return NOTHING
-            self._answer_us = max(self._answer_us, now_us) + self.ANSWER_INTERVAL_US
+        if handler != self._on_list and not self._answers.take(sender, now_us):
+            self.dropped += 1
+            return NOTHING
         return handler(message, sender, now_us)
 
     def step(self, now_us: int) -> Sequence[Message]:
@@ -233,15 +233,18 @@ class ParameterServer:
             self._hash_first = False
             return self._hash()
         name = self._table.names[self._next]
-        self._next += 1
-        if self._next == len(self._table.names):
+        self._next = (self._next + 1) % len(self._table.names)
+        self._left -= 1
+        if not self._left:
             self._next = None
         return self._value(name)
 
     def _on_list(self, message: Message, sender: Peer, now_us: int) -> Sequence[Message]:
         # Whoever asks again while the list runs did not find the hash in its cache.
         self._hash_first = self._next is None
-        self._next = 0
+        # It goes on where it is, once round: who asks again and again would else hear its beginning alone.
+        self._next = self._next or 0
+        self._left = len(self._table.names)
         return NOTHING
 
     def _on_read(self, message: Message, sender: Peer, now_us: int) -> Sequence[Message]:

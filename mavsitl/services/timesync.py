@@ -15,12 +15,12 @@ from statistics import median
 from mavsitl.codec import Message
 from mavsitl.dialect import mavlink
 from mavsitl.services.base import NOTHING, Peer
-from mavsitl.services.bucket import TokenBucket
+from mavsitl.services.bucket import FairBuckets
 
 __all__ = ["ClockOffset", "Echo", "PingClient", "PingServer", "TimesyncClient", "TimesyncServer"]
 
 ANSWERS_HZ = 200.0
-"""Answers a second and link above which requests are left unanswered: mavros asks 10 times a second."""
+"""Answers a second and asker above which requests are left unanswered: mavros asks 10 times a second."""
 ANSWERS_BURST = 50
 
 PENDING = 16
@@ -45,14 +45,14 @@ class TimesyncServer:
     """
 
     def __init__(self, rate_hz: float = ANSWERS_HZ, burst: float = ANSWERS_BURST) -> None:
-        self._bucket = TokenBucket(rate_hz, burst)
+        self._buckets = FairBuckets(rate_hz, burst)
         self.refused = 0
 
     def receive(self, message: Message, sender: Peer, now_us: int) -> Sequence[Message]:
         """A TIMESYNC; `now_us` is the clock to be told, µs."""
         if message.tc1 != 0:
             return NOTHING
-        if not self._bucket.take(now_us):
+        if not self._buckets.take(sender, now_us):
             self.refused += 1
             return NOTHING
         # An answer of 0 would be a request.
@@ -166,14 +166,14 @@ class PingServer:
     """
 
     def __init__(self, rate_hz: float = ANSWERS_HZ, burst: float = ANSWERS_BURST) -> None:
-        self._bucket = TokenBucket(rate_hz, burst)
+        self._buckets = FairBuckets(rate_hz, burst)
         self.refused = 0
 
     def receive(self, message: Message, sender: Peer, now_us: int) -> Sequence[Message]:
         """A PING; with a target it is an answer to somebody's."""
         if message.target_system != 0 or message.target_component != 0:
             return NOTHING
-        if not self._bucket.take(now_us):
+        if not self._buckets.take(sender, now_us):
             self.refused += 1
             return NOTHING
         return (mavlink.MAVLink_ping_message(message.time_usec, message.seq, *sender),)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mavsitl.codec import encode, parse
 from mavsitl.dialect import mavlink
 from mavsitl.services.base import NOTHING, Peer
-from mavsitl.services.bucket import TokenBucket
+from mavsitl.services.bucket import FairBuckets, TokenBucket
 from mavsitl.services.timesync import ClockOffset, PingClient, PingServer, TimesyncClient, TimesyncServer
 from tests.services.lossy import CLIENT, SERVER, LossyLink
 
@@ -193,9 +193,22 @@ def test_a_ping_with_a_target_is_not_answered(target: Peer) -> None:
 def test_a_flood_of_pings_is_answered_at_a_bounded_rate() -> None:
     server = PingServer(rate_hz=100.0, burst=10)
     request = mavlink.MAVLink_ping_message(1, 2, 0, 0)
-    answers = sum(len(server.receive(request, (k % 250, 1), k * 50)) for k in range(20_000))
+    answers = sum(len(server.receive(request, CLIENT, k * 50)) for k in range(20_000))
     assert 109 <= answers <= 111
     assert server.refused == 20_000 - answers
+    answers = sum(len(server.receive(request, (k % 250, 2), 10**6 + k * 50)) for k in range(20_000))
+    assert answers <= FairBuckets.SHARES * 110 + 1
+
+
+def test_who_asks_too_much_takes_nothing_from_the_others() -> None:
+    server = PingServer(rate_hz=100.0, burst=10)
+    request = mavlink.MAVLink_ping_message(1, 2, 0, 0)
+    answered = 0
+    for k in range(20_000):
+        server.receive(request, (66, 1), k * 50)
+        if k % 1000 == 0:
+            answered += len(server.receive(request, CLIENT, k * 50))
+    assert answered == 20
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2])

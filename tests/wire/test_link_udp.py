@@ -11,7 +11,7 @@ import pytest
 
 from mavsitl.codec import MAX_DATAGRAM_BYTES
 from mavsitl.link.base import Link, LinkError, LinkSilent, Source
-from mavsitl.link.udp import LOOPBACK, MAX_PEERS, PEER_SILENCE_US, ConnectedUdp, UdpLink
+from mavsitl.link.udp import LOOPBACK, MAX_PEERS, NEWCOMER_BYTES, PEER_SILENCE_US, ConnectedUdp, UdpLink
 
 pytestmark = pytest.mark.sockets
 
@@ -100,6 +100,23 @@ def test_the_number_of_peers_is_bounded_and_nobody_is_pushed_out(udp: Callable[.
     assert vehicle.admit(peers[0], PEER_SILENCE_US)
     assert vehicle.admit(peers[-1], PEER_SILENCE_US + 1)
     assert vehicle.peers == (peers[0], peers[-1])
+
+
+def test_who_spoke_once_is_sent_no_more_than_a_newcomer_s_share(udp: Callable[..., UdpLink]) -> None:
+    """One datagram with a forged source brings its victim so much, and then silence."""
+    vehicle, visitor = udp(), udp()
+    datagram = bytes(1000)
+    for _ in range(3):  # what came at once counts once
+        assert vehicle.admit(visitor.address, 1_000_000)
+    for _ in range(100):
+        vehicle.send(datagram)
+    assert vehicle.withheld == 100 - NEWCOMER_BYTES // len(datagram)
+    assert visitor.wait(LIMIT_S)
+    assert len(visitor.receive(0)) == NEWCOMER_BYTES // len(datagram)
+    assert vehicle.admit(visitor.address, 1_000_001)
+    for _ in range(20):
+        vehicle.send(datagram)
+    assert len(visitor.receive(0)) == 20
 
 
 def test_nobody_listening_is_no_error_before_or_after_a_client(udp: Callable[..., UdpLink]) -> None:

@@ -10,6 +10,7 @@ from mavsitl.codec import Counters
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector
 from mavsitl.keep import Work
+from mavsitl.link.budget import Excess
 from mavsitl.link.settings import LinkName, Overlay
 from mavsitl.log.block import Array
 from mavsitl.log.ulog import Recorder
@@ -78,7 +79,7 @@ class Vehicle:
         self.parameters.put("MAV_SYS_ID", system_id)  # what was kept does not outweigh what was asked for
         plan_store = Store(state, "plan", PLAN_SCHEMA, self.warn)
         self.plan = VehiclePlan(
-            report=lambda severity, text: self.autopilot.queue_text(severity, text),
+            report=lambda severity, text: self.autopilot.say(severity, text),
             changed=lambda mission_type: plan_store.put(self.plan.to_document),
         )
         self._load_plan(plan_store)
@@ -245,6 +246,14 @@ class Vehicle:
         """
         now_us = max(self._now_us - self._boot_us, 0)
         return self.autopilot.receive(port, datagram, now_us, None if at_us is None else at_us - self._boot_us)
+
+    def refuse(self, port: int, excess: Excess) -> None:
+        """A datagram from a link was dropped unread, for its source had used up its budget; only counted."""
+        counters = self.autopilot.ports[port].node.counters
+        if excess is Excess.SOURCE:
+            counters.over_budget += 1
+        else:
+            counters.crowded += 1
 
     def step(self, now_us: int) -> None:
         """Fly from the last step to `now_us`, one control period later, and say what is to be said there."""

@@ -44,6 +44,8 @@ UPRIGHT_TILT_RAD = radians(60.0)
 """PX4's FD_FAIL_R and FD_FAIL_P: beyond this the vehicle has fallen over."""
 MAX_TEXTS = 50
 """STATUSTEXTs that wait for the end of a period; what is beyond them is lost."""
+ANSWERS_HZ, ANSWERS_BURST = 2.0, 10.0
+"""Texts of one kind that commands, modes and plans are answered by."""
 LOOK_US = 12_000
 """So often the commander decides (PX4's: every 10 ms). A command, or a stream that returns, makes it look at once."""
 HOUSEKEEPING_US = 100_000
@@ -89,7 +91,7 @@ class Autopilot:
         self.parameters = parameters
         self.body = body
         self.plan = shared.plan
-        self.commander = Commander(parameters, self.queue_text)
+        self.commander = Commander(parameters, self.say)
         self.estimate: list[float] = [0.0] * 6 + [1.0] + [0.0] * 6
         """Position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s: what telemetry says."""
         self.accuracy = telemetry.accuracy(scenario.noise)
@@ -135,6 +137,7 @@ class Autopilot:
         self._texts: list[Message] = []
         self._text_id = 0
         self._limiter = TextLimiter()
+        self._answers = TextLimiter(ANSWERS_HZ, ANSWERS_BURST)
         self._now_us = 0
         self._shown: tuple[Mode, bool, bool, int] | None = None
         self._gcs_us: int | None = None
@@ -158,7 +161,9 @@ class Autopilot:
     # --- messages in -------------------------------------------------------------------------------------------------
 
     def receive(self, port_index: int, datagram: bytes, now_us: int, at_us: int | None = None) -> int:
-        """Take one datagram from a link; the number of frames in it that tell who sent it. Never raises on its content.
+        """Take one datagram from a link; the number of frames in it that tell who sent it.
+
+        Never raises on its content: what no handler foresaw ends that message, and is counted in `Counters.errors`.
 
         Where signatures are demanded, a frame that is let in without one tells nothing. `now_us` is the last tick's
         time, `at_us` when the datagram came; None: then.
@@ -174,15 +179,29 @@ class Autopilot:
             if several and (frame.signed or not signed_only):
                 self._router.note(port_index, (frame.system_id, frame.component_id), now_us)
             if node.addressed_to(frame):
-                handler = self._handlers.get(type(message).id)
-                if handler is not None:
-                    handler(message, frame, now_us)
-                elif not port.receive(message, (frame.system_id, frame.component_id), now_us, at_us):
-                    node.counters.unsupported += 1
+                try:
+                    handler = self._handlers.get(type(message).id)
+                    if handler is not None:
+                        handler(message, frame, now_us)
+                    elif not port.receive(message, (frame.system_id, frame.component_id), now_us, at_us):
+                        node.counters.unsupported += 1
+                except Exception as error:
+                    self._on_error(error, frame, port)
             if several:
                 for other in self._router.destinations(port_index, frame, now_us):
                     self.ports[other].forward(message.get_msgbuf(), now_us)
         return sum(frame.signed for frame in frames) if signed_only else len(frames)
+
+    def _on_error(self, error: Exception, frame: Frame, port: Port) -> None:
+        """A bug of ours that a message found: the flight goes on without that message, and the bug is seen."""
+        port.node.counters.errors += 1
+        name = frame.message.get_type()
+        text = self._limiter.admit("error", f"{name} dropped: {type(error).__name__}", self._now_us)
+        if text is not None:
+            import logging
+
+            logging.getLogger("mavsitl").error("%s", text, exc_info=error)
+            self.queue_text(mavlink.MAV_SEVERITY_ERROR, text)
 
     def _on_attitude_target(self, message: Message, frame: Frame, now_us: int) -> None:
         self.token_us = message.time_boot_ms * 1000
@@ -304,6 +323,12 @@ class Autopilot:
             return
         self._text_id = self._text_id % 65535 + 1
         self._texts += chunks(severity, text, self._text_id)
+
+    def say(self, severity: int, text: str) -> None:
+        """A text that a request may cause again and again: what is before its first colon speaks at a bounded rate."""
+        admitted = self._answers.admit(text.partition(":")[0], text, self._now_us)
+        if admitted is not None:
+            self.queue_text(severity, admitted)
 
     def warn(self, reason: str, text: str) -> None:
         """A warning that a hostile or broken peer may cause: each reason speaks at a bounded rate."""
