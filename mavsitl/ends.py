@@ -67,12 +67,18 @@ IMPAIRED_GRACE_S = 300.0
 """Over an impaired link a flight in lock-step that takes so much longer than its scenario says will never end."""
 
 
-def _channels(flight: Flight) -> Channels | None:
-    if flight.scenario.link == LinkModel():
+def _impaired_lockstep(flight: Flight) -> bool:
+    """Whether a tick may pass without an answer: over an impaired link, or where the vehicle misbehaves."""
+    return flight.scenario.link != LinkModel() or bool(flight.scenario.chaos)
+
+
+def _channels(flight: Flight, *, lockstep: bool) -> Channels | None:
+    always = lockstep and _impaired_lockstep(flight)
+    if flight.scenario.link == LinkModel() and not always:
         return None
     from mavsitl.link.impaired import channels_for  # here, for it loads numpy
 
-    return channels_for(flight.scenario.link, flight.scenario.seed)
+    return channels_for(flight.scenario.link, flight.scenario.seed, always=always)
 
 
 @contextmanager
@@ -161,7 +167,7 @@ def vehicle_lockstep(
                 flight, recorder, seed=flight.scenario.seed, system_id=system_id, ports=("offboard",), lockstep=True
             )
             watch = _Watch(core)
-            channels = _channels(flight)
+            channels = _channels(flight, lockstep=True)
             end_us = drivers.run_lockstep_vehicle(
                 core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
                 channels=channels, max_time_s=flight.scenario.duration_s + IMPAIRED_GRACE_S,
@@ -191,7 +197,7 @@ def ground_lockstep(
             watch = _Watch(core)
             end_us = drivers.run_lockstep_ground(
                 core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
-                impaired=flight.scenario.link != LinkModel(),
+                impaired=_impaired_lockstep(flight),
             )  # fmt: skip
             return watch.outcome(end_us, tap)
     finally:
@@ -217,7 +223,7 @@ def vehicle_realtime(
                 host_option="--bind HOST",
             )
         )
-        channels = _channels(flight)
+        channels = _channels(flight, lockstep=False)
         impaired = None if channels is None else _impaired(opened[0], channels, speed)
         if impaired is not None:
             opened[0] = impaired
@@ -302,7 +308,7 @@ def in_memory(
         vehicle = wings.find(wings.VEHICLE_GROUP)(flight, vehicle_recorder, seed=flight.scenario.seed, lockstep=True)
         ground = wings.find(wings.GROUND_GROUP)(flight, ground_recorder, report=report)
         watch = _Watch(ground)
-        channels = _channels(flight)
+        channels = _channels(flight, lockstep=True)
         limit_s = inf if channels is None else flight.scenario.duration_s + IMPAIRED_GRACE_S
         end_us = drivers.fly_in_memory(vehicle, ground, tap, max_time_s=limit_s, progress=progress, channels=channels)
         return watch.outcome(end_us, tap, channels=channels)

@@ -277,9 +277,12 @@ class Channels:
         }
 
 
-def channels_for(model: LinkModel, seed: int) -> Channels | None:
-    """Both channels of a scenario's link; None where it is perfect, and nothing is to be between the ends."""
-    if model == LinkModel():
+def channels_for(model: LinkModel, seed: int, *, always: bool = False) -> Channels | None:
+    """Both channels of a scenario's link; None where it is perfect, and nothing is to be between the ends.
+
+    `always`: also of a perfect one, for ends that do not answer each other tick by tick.
+    """
+    if model == LinkModel() and not always:
         return None
     return Channels(Channel(model.to_ground, seed, "to_ground"), Channel(model.to_vehicle, seed, "to_vehicle"))
 
