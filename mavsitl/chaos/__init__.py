@@ -29,7 +29,8 @@ __all__ = ["ALL_PORTS", "PORTS", "TABLE", "Chaos", "ChaosError", "parse"]
 class Chaos:
     """What misbehaves on the ports of one vehicle.
 
-    Modes act in the order in which they began: what one lets out goes through those after it.
+    Modes act in the order in which they began: what one lets out goes through those after it. `begin`, `end`, `during`
+    and `clear` may be called from another thread than the vehicle's, one at a time.
     """
 
     def __init__(
@@ -185,18 +186,17 @@ class _Port:
     def begin(self, key: tuple[str, str], spec: Spec) -> None:
         mode = spec.make()
         mode.line = _Line(self, mode, spec.name)
-        self._modes[key] = mode
+        self._modes = {**self._modes, key: mode}  # another one, for the vehicle's thread may go through the old
         self.node.tamper = self
 
     def end(self, key: tuple[str, str]) -> None:
         """What the mode held back still goes out when it is due."""
-        self._modes.pop(key, None)
+        self._modes = {other: mode for other, mode in self._modes.items() if other != key}
 
     def step(self) -> None:
         for mode in tuple(self._modes.values()):
             mode.step()
-        if not self._modes and not self._held:
-            self.node.tamper = None
+        self.node.tamper = self if self._modes or self._held else None
 
     def hold(self, mode: Mode, message: Message, after_us: int) -> None:
         self._order += 1

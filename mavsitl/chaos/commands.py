@@ -170,9 +170,8 @@ class ProgressForEver(CommandMode):
 
     def __init__(self, command: int | None) -> None:
         super().__init__(command)
-        self._running: OrderedDict[tuple[int, Peer], int] = OrderedDict()
-        """By command and asker: IN_PROGRESS said so often."""
-        self._every = Every(PROGRESS_S)
+        self._running: OrderedDict[tuple[int, Peer], tuple[int, Every]] = OrderedDict()
+        """By command and asker: IN_PROGRESS said so often, and when again."""
 
     def incoming(self, message: Message, sender: Peer) -> Message | None:
         if not self.meant(message):
@@ -181,19 +180,19 @@ class ProgressForEver(CommandMode):
         if key not in self._running:
             if len(self._running) >= REMEMBERED:
                 self._running.popitem(last=False)
-            self._running[key] = 0
-            self._say(key)
+            self._running[key] = (0, Every(PROGRESS_S))
+            self._say()
         return None
 
     def step(self) -> None:
-        if self._every.due(self.line.now_us):
-            for key in self._running:
-                self._say(key)
+        self._say()
 
-    def _say(self, key: tuple[int, Peer]) -> None:
-        command, asker = key
-        self.line.send(_ack(command, IN_PROGRESS, asker, min(self._running[key], 99)))
-        self._running[key] += 1
+    def _say(self) -> None:
+        for key, (count, every) in self._running.items():
+            if every.due(self.line.now_us):
+                command, asker = key
+                self.line.send(_ack(command, IN_PROGRESS, asker, min(count, 99)))
+                self._running[key] = (count + 1, every)
 
 
 class ProgressStuck(CommandMode):

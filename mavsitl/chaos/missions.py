@@ -82,7 +82,7 @@ class SequenceWrong(Mode):
         self._seq = seq
 
     def outgoing(self, message: Message) -> Sequence[Message]:
-        return (altered(message, seq=message.seq + 1) if message.seq == self._seq else message,)
+        return (altered(message, seq=(message.seq + 1) & 0xFFFF) if message.seq == self._seq else message,)
 
 
 class ItemRefused(Mode):

@@ -78,23 +78,24 @@ def _number(least: float, most: float, words: str, whole: bool = False) -> Calla
     return read
 
 
-def _enumeration(enum: str, *, optional: bool = False) -> Callable[[str], int | None]:
-    """A value of a MAVLink enumeration by its number or its name, the enumeration's own name left out or not."""
+def _enumeration(enum: str, *, begin: str = "", most: int = 255, optional: bool = False) -> Callable[[str], int | None]:
+    """A value of a MAVLink enumeration by its number or its name, with or without `begin`: the enumeration's own."""
+    begin = begin or f"{enum}_"
 
     def read(text: str) -> int | None:
         if not text and optional:
             return None
+        if text.isascii() and text.isdigit() and int(text) <= most:
+            return int(text)
         names: dict[str, int] = {
-            str(entry.name).removeprefix(f"{enum}_"): number
+            str(entry.name): number
             for number, entry in mavlink.enums[enum].items()
             if not str(entry.name).endswith("_ENUM_END")
         }
-        if text.isascii() and text.isdigit() and int(text) <= 0xFFFF:
-            return int(text)
-        name = text.upper().removeprefix(f"{enum}_")
+        name = begin + text.upper().removeprefix(begin)
         if name in names:
             return names[name]
-        near = get_close_matches(name, names, 3) or list(names)[:6]
+        near = [each.removeprefix(begin) for each in get_close_matches(name, names, 3) or list(names)[:6]]
         raise ValueError(f"a number or a name of {enum}, for example {', '.join(near)}")
 
     return read
@@ -125,10 +126,10 @@ _seconds_or_none = _number(0.0, 3600.0, "seconds from 0 (for good) to 3600")
 _share = _number(0.0, 1.0, "a share from 0 to 1")
 _hz = _number(0.01, 1000.0, "a rate from 0.01 to 1000 Hz")
 
-COMMAND = Argument("command", _enumeration("MAV_CMD", optional=True), "")
-REQUIRED_COMMAND = Argument("command", _enumeration("MAV_CMD"), "DO_SET_MODE")
+COMMAND = Argument("command", _enumeration("MAV_CMD", most=0xFFFF, optional=True), "")
+REQUIRED_COMMAND = Argument("command", _enumeration("MAV_CMD", most=0xFFFF), "DO_SET_MODE")
 RESULT = Argument("result", _enumeration("MAV_RESULT"), "DENIED")
-MISSION_RESULT = Argument("result", _enumeration("MAV_MISSION_RESULT"), "ERROR")
+MISSION_RESULT = Argument("result", _enumeration("MAV_MISSION_RESULT", begin="MAV_MISSION_"), "ERROR")
 PARAMETER = Argument("parameter", _name, "MIS_TAKEOFF_ALT")
 MESSAGE = Argument("message", _message_id, "")
 
@@ -245,12 +246,12 @@ TABLE: Mapping[str, Row] = {
     ),
     "heartbeat-autopilot": Row(
         _HEARTBEAT, "HEARTBEAT names this MAV_AUTOPILOT",
-        lambda value: telemetry.Altered("HEARTBEAT", _named(autopilot=value & 0xFF)),
+        lambda value: telemetry.Altered("HEARTBEAT", _named(autopilot=value)),
         (Argument("autopilot", _enumeration("MAV_AUTOPILOT"), "ARDUPILOTMEGA"),),
     ),
     "heartbeat-type": Row(
         _HEARTBEAT, "HEARTBEAT names this MAV_TYPE",
-        lambda value: telemetry.Altered("HEARTBEAT", _named(type=value & 0xFF)),
+        lambda value: telemetry.Altered("HEARTBEAT", _named(type=value)),
         (Argument("type", _enumeration("MAV_TYPE"), "FIXED_WING"),),
     ),
     "comm-lost": Row(
