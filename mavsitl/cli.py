@@ -84,6 +84,15 @@ examples:
   mavsitl vehicle                                    a vehicle on the ground, in calm air, on PX4's ports
   mavsitl vehicle hover-wind --instance 1            a second one: ports 18571, 14581, system id 2
   mavsitl vehicle hover-wind --bind 0.0.0.0 --offboard-remote 192.0.2.7:14540
+  mavsitl vehicle --chaos ack-first-lost --chaos ftp-drops:0.3@gcs
+"""
+
+CHAOS_HELP = """\
+List what mavsitl vehicle --chaos makes the vehicle do wrong, for tests of ground stations and SDKs: acknowledgements
+that are lost, late, doubled, refused; transfers of parameters, missions and files that break; silence.
+
+A mode is written NAME[:ARGUMENT...][@PORT], for example ack-late:2.5:NAV_TAKEOFF@gcs; PORT is all, offboard or gcs.
+Arguments may be left out from the right; an empty one is the default.
 """
 
 GROUND_HELP = """\
@@ -249,6 +258,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _exit_code(error: Exception) -> int | None:
     """Of an error whose text is for the user; None for any other. They are loaded here: most runs have none."""
+    from mavsitl.chaos.table import ChaosError
     from mavsitl.link.address import AddressError
     from mavsitl.link.base import LinkError
     from mavsitl.log.errors import LogError
@@ -257,7 +267,7 @@ def _exit_code(error: Exception) -> int | None:
     from mavsitl.scenario import ScenarioError
     from mavsitl.wings import WingError
 
-    if isinstance(error, (UsageError, ScenarioError, AddressError, WingError)):
+    if isinstance(error, (UsageError, ScenarioError, ChaosError, AddressError, WingError)):
         return EXIT_USAGE
     return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RunError)) else None
 
@@ -276,6 +286,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_param(commands)
     _add_report(commands)
     _add_scenarios(commands)
+    _add_chaos(commands)
     return parser
 
 
@@ -412,6 +423,10 @@ def _add_vehicle(commands: Any) -> None:
         help=f"simulated over wall time, {SLOWEST_SPEED:g} or more: slower, the 1 Hz HEARTBEAT "
         "would count as lost (default: 1)",
     )
+    parser.add_argument(
+        "--chaos", action="append", metavar="MODE",
+        help="misbehave in this way, NAME[:ARGUMENT...][@PORT]; 'mavsitl chaos' lists all; may be repeated",
+    )  # fmt: skip
     parser.add_argument("--until-disarmed", action="store_true", default=None, help="end after the first flight")
     parser.set_defaults(run=_vehicle)
 
@@ -564,6 +579,12 @@ def _add_scenarios(commands: Any) -> None:
     )
     parser.add_argument("--json", action="store_true", help="as JSON")
     parser.set_defaults(run=_scenarios)
+
+
+def _add_chaos(commands: Any) -> None:
+    parser = _command(commands, "chaos", "list what a vehicle can do wrong on MAVLink", CHAOS_HELP)
+    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.set_defaults(run=_chaos)
 
 
 # --- commands --------------------------------------------------------------------------------------------------------
@@ -826,10 +847,25 @@ def _state_folder(options: argparse.Namespace, system_id: int) -> Path | None:
     return user_data_path("mavsitl", appauthor=False) / f"vehicle-{system_id}"
 
 
+def _with_chaos(flight: Flight, modes: Sequence[str]) -> Flight:
+    """The scenario's, and these from the start on. Raises `ChaosError`."""
+    if not modes:
+        return flight
+    import msgspec
+
+    from mavsitl.chaos.table import parse
+    from mavsitl.scenario import ChaosWindow
+
+    entries = [{"mode": mode.partition("@")[0], "port": parse(mode).port} for mode in modes]
+    added = msgspec.convert(entries, tuple[ChaosWindow, ...])
+    scenario = msgspec.structs.replace(flight.scenario, chaos=flight.scenario.chaos + added)
+    return msgspec.structs.replace(flight, scenario=scenario)
+
+
 def _vehicle(options: argparse.Namespace) -> int:
     from mavsitl import ends
 
-    flight = _load(options.scenario, _settings(options))
+    flight = _with_chaos(_load(options.scenario, _settings(options)), options.chaos or ())
     instance = options.instance
     system_id = options.system if options.system is not None else instance + 1
     offboard_remote = options.offboard_remote or f"127.0.0.1:{ends.OFFBOARD_REMOTE_PORT + instance}"
@@ -845,7 +881,8 @@ def _vehicle(options: argparse.Namespace) -> int:
     _check_lockstep(
         options,
         real_time_only=(
-            "--speed", "--until-disarmed", "--gcs-port", "--gcs-remote", "--tcp-port", "--state-dir", "--no-state"
+            "--speed", "--until-disarmed", "--gcs-port", "--gcs-remote", "--tcp-port", "--state-dir", "--no-state",
+            "--chaos",
         ),
         lockstep_only=("--deadline", "--cpu"),
     )  # fmt: skip
@@ -867,6 +904,8 @@ def _vehicle(options: argparse.Namespace) -> int:
             f"ground station {links.bind}:{links.gcs_port} -> {links.gcs_remote[0]}:{links.gcs_remote[1]}; "
             "Ctrl-C ends it"
         )
+        for window in flight.scenario.chaos:
+            status.say(f"misbehaves: {window.mode} on port {window.port}")
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
             until_finished=bool(options.until_disarmed), state=_state_folder(options, system_id),
@@ -1181,4 +1220,34 @@ def _scenarios(options: argparse.Namespace) -> int:
             flight.name, s.title, s.airframe, wind, str(s.reference.__struct_config__.tag), s.controller.level
         )
     Console().print(table)
+    return EXIT_OK
+
+
+def _chaos(options: argparse.Namespace) -> int:
+    from mavsitl.chaos.table import TABLE
+
+    if options.json:
+        import msgspec
+
+        rows = [
+            {
+                "name": name, "group": row.group, "does": row.text, "mocklink": row.mocklink,
+                "arguments": [{"name": each.name, "default": each.default} for each in row.arguments],
+            }
+            for name, row in TABLE.items()
+        ]  # fmt: skip
+        print(msgspec.json.format(msgspec.json.encode(rows), indent=2).decode())
+        return EXIT_OK
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    for group in dict.fromkeys(row.group for row in TABLE.values()):
+        table = Table("mode", "what goes wrong", title=group, title_justify="left", title_style="bold", expand=True)
+        table.columns[0].no_wrap = True
+        for name, row in TABLE.items():
+            if row.group == group:
+                defaults = ", ".join(f"{each.name} {each.default}" for each in row.arguments if each.default)
+                table.add_row(row.usage(name).replace("[", r"\["), row.text + (f" ({defaults})" if defaults else ""))
+        console.print(table)
     return EXIT_OK

@@ -35,6 +35,7 @@ __all__ = [
     "encode",
     "packer",
     "parse",
+    "renumber",
 ]
 
 Message: TypeAlias = Any
@@ -285,6 +286,15 @@ def encode(message: Message, sequence: int, system_id: int, component_id: int) -
     if function is None:
         function = _encoders[message_class] = _build_encoder(message_class)
     return function(message, sequence, system_id, component_id)
+
+
+def renumber(frame: bytes, sequence: int) -> bytes:
+    """The same unsigned MAVLink 2 frame of a known message with another sequence number."""
+    if frame[4] == sequence:
+        return frame
+    body = frame[:4] + bytes((sequence,)) + frame[5:-_CRC_BYTES]
+    extra = mavlink.mavlink_map[int.from_bytes(frame[7:10], "little")].crc_extra
+    return body + _write_crc(_crc(body + bytes((extra,)), _CRC_BEFORE_V2))
 
 
 # -------------------------------------------------------------------------------------------------------- decoding

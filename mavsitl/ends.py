@@ -78,13 +78,18 @@ IMPAIRED_GRACE_S = 300.0
 """Over an impaired link a flight in lock-step that takes so much longer than its scenario says will never end."""
 
 
-def _channels(flight: Flight) -> Channels | None:
-    """Of the off-board link in lock-step; a perfect one has none."""
-    if flight.scenario.link == LinkModel():
-        return None
-    from mavsitl.link.impaired import channels_for  # here, for it loads numpy
+def _impaired_lockstep(flight: Flight) -> bool:
+    """Whether a tick may pass without an answer: over an impaired link, or where the vehicle misbehaves."""
+    return flight.scenario.link != LinkModel() or bool(flight.scenario.chaos)
 
-    return channels_for(flight.scenario.link, flight.scenario.seed)
+
+def _channels(flight: Flight) -> Channels | None:
+    """Of the off-board link in lock-step; None where each tick is answered."""
+    if not _impaired_lockstep(flight):
+        return None
+    from mavsitl.link.impaired import Channels  # here, for it loads numpy
+
+    return Channels(flight.scenario.link, flight.scenario.seed)
 
 
 def _watch_lockstep_link(core: Any, channels: Channels | None, recorder: Recorder, tap: Tap) -> None:
@@ -300,7 +305,7 @@ def ground_lockstep(
             watch = _Watch(core)
             end_us = drivers.run_lockstep_ground(
                 core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
-                impaired=flight.scenario.link != LinkModel(),
+                impaired=_impaired_lockstep(flight),
             )  # fmt: skip
             return watch.outcome(end_us, tap)
     finally:

@@ -6,12 +6,14 @@ link of the same component gets a node of its own: sequence numbers count per li
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from mavsitl.codec import Counters, Frame, Message, Packer, encode, parse
 from mavsitl.signing import LinkSigning
 
-__all__ = ["DATAGRAM_BYTES", "MAX_SOURCES", "Node", "SourceStatistics"]
+__all__ = ["DATAGRAM_BYTES", "MAX_SOURCES", "Node", "SourceStatistics", "Tamper"]
 
 DATAGRAM_BYTES = 1400
 """Combined datagrams end here: an Ethernet packet's 1500 bytes less IP and UDP headers and room for a tunnel."""
@@ -64,6 +66,22 @@ class SourceStatistics:
             self.lost -= 1
 
 
+class Tamper(Protocol):
+    """What stands between a node and its link where the endpoint is to misbehave: `mavsitl.chaos`."""
+
+    def incoming(self, frames: Sequence[Frame]) -> list[Frame]:
+        """What is handed on of the frames that came; for whoever dispatches them."""
+
+    def outgoing(self, frames: Sequence[bytes], sequence: int) -> tuple[list[bytes], int]:
+        """What goes out in the place of `frames`, not signed yet, and the sequence number that comes after it.
+
+        `sequence` is the one after `frames`.
+        """
+
+    def wire(self, frames: Sequence[bytes]) -> list[bytes]:
+        """What goes out in the place of whole frames."""
+
+
 class Node:
     """A MAVLink endpoint: `send` and `datagrams` outwards, `receive` inwards.
 
@@ -73,6 +91,7 @@ class Node:
         own_frames: frames dropped because they carry the node's own address (an echo).
         sources: statistics by (system id, component id), at most `MAX_SOURCES`.
         signing: signs and checks what passes, see `mavsitl.signing`; None for a link that knows no signatures.
+        tamper: makes the endpoint misbehave, see `mavsitl.chaos`; None for one that behaves.
     """
 
     def __init__(self, system_id: int, component_id: int, signing: LinkSigning | None = None) -> None:
@@ -84,6 +103,7 @@ class Node:
         self.counters = Counters()
         self.own_frames = 0
         self.signing = signing
+        self.tamper: Tamper | None = None
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
         self._sequence = 0
         self._frames_heard = 0
@@ -119,8 +139,12 @@ class Node:
             combine: put as many frames into a datagram as fit, instead of one frame each, which is what PX4 does.
         """
         frames, self._outbox = self._outbox, []
+        if self.tamper is not None:
+            frames, self._sequence = self.tamper.outgoing(frames, self._sequence)
         if self.signing is not None:
             frames = self.signing.outgoing(frames, (self.system_id, self.component_id))
+        if self.tamper is not None:
+            frames = self.tamper.wire(frames)
         if not combine:
             return frames
         datagrams: list[bytes] = []

@@ -216,6 +216,19 @@ class LinkModel(Section, frozen=True):
     """
 
 
+class ChaosWindow(Section, frozen=True):
+    """The vehicle misbehaves on purpose, from `start_s` on, for `duration_s`. See the how-to on protocol chaos."""
+
+    mode: str
+    """A mode with its arguments, e.g. `ack-late:2.5`; `mavsitl chaos` lists all."""
+    port: Literal["all", "offboard", "gcs"] = "all"
+    start_s: NonNegative = 0.0
+    duration_s: Positive | None = None
+    """None: to the end."""
+    clock: Literal["flight", "simulated"] = "simulated"
+    """Of `start_s`: since the release or the lift-off, or since the vehicle's start."""
+
+
 class Hover(Section, frozen=True, tag_field="kind", tag="hover"):
     position_nwu_m: Vector3 = (0.0, 0.0, 1.0)
     yaw_deg: float = 0.0
@@ -341,6 +354,8 @@ class Scenario(Section, frozen=True):
     """The off-board link."""
     gcs_link: LinkModel = LinkModel()
     """Each of the ground stations' links, over UDP and TCP; there is none in lock-step."""
+    chaos: tuple[ChaosWindow, ...] = ()
+    """What the vehicle does wrong on its MAVLink ports."""
     parameters: dict[str, float] = {}
     """PX4 parameters of the vehicle, over the airframe's."""
     controller: Controller = Controller()
@@ -593,6 +608,8 @@ def _check(scenario: Scenario, where: str) -> None:
         )
     _check_link(scenario.link, f"{where}: link")
     _check_link(scenario.gcs_link, f"{where}: gcs_link")
+    if scenario.chaos:
+        _check_chaos(scenario.chaos, where)
     steps = scenario.reference.steps if isinstance(scenario.reference, Steps) else ()
     if any(later.time_s <= earlier.time_s for earlier, later in pairwise(steps)):
         raise ScenarioError(f"{where}: reference.steps: time_s must increase from step to step")
@@ -610,6 +627,18 @@ def _check_link(model: LinkModel, where: str) -> None:
         times_s = [change.at_s for change in model.changes if change.clock == clock]
         if any(later < earlier for earlier, later in pairwise(times_s)):
             raise ScenarioError(f"{where}.changes: at_s must not decrease from change to change (clock = '{clock}')")
+
+
+def _check_chaos(windows: tuple[ChaosWindow, ...], where: str) -> None:
+    from mavsitl.chaos.table import ChaosError, parse  # here, for few scenarios need it
+
+    for index, window in enumerate(windows):
+        try:
+            if "@" in window.mode:
+                raise ChaosError(f"'{window.mode}' is not allowed; the port has a key of its own")
+            parse(window.mode)
+        except ChaosError as error:
+            raise ScenarioError(f"{where}: chaos[{index}].mode: {error}") from None
 
 
 def _check_impairment(impairment: Impairment, where: str) -> None:

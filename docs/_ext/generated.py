@@ -15,6 +15,8 @@
     what trips each fail-safe and what it does by the value of its parameter.
 ``{parameter-tables}``
     A section for each group of the vehicle's parameters: name, type, default, allowed values, meaning.
+``{chaos-modes}``
+    What a vehicle does wrong on command: a table for each group of modes.
 ``{cli-help} SUBCOMMAND``
     What ``mavsitl SUBCOMMAND --help`` prints.
 """
@@ -43,7 +45,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.typing import ExtensionMetadata
 
-from mavsitl import scenario
+from mavsitl import chaos, scenario
 from mavsitl.dialect import mavlink
 from mavsitl.ends import NullRecorder
 
@@ -609,6 +611,25 @@ class ParameterTables(GeneratedDirective):
         ]
 
 
+class ChaosModes(GeneratedDirective):
+    """`chaos.TABLE`."""
+
+    def run(self) -> list[nodes.Node]:
+        return [self.group(group) for group in dict.fromkeys(row.group for row in chaos.TABLE.values())]
+
+    def group(self, group: str) -> nodes.Node:
+        rows = []
+        for name, row in chaos.TABLE.items():
+            if row.group == group:
+                defaults = ", ".join(f"{each.name} {each.default or 'all'}" for each in row.arguments)
+                mocklink = [self.code(each) for each in row.mocklink.split(", ") if each]
+                cells = [
+                    node for index, each in enumerate(mocklink) for node in ([nodes.Text(" ")] * bool(index)) + each
+                ]
+                rows.append([self.code(row.usage(name)), self.text(row.text), self.text(defaults), cells])
+        return self.section(group, self.table(("mode", "what goes wrong", "defaults", "MockLink's name"), rows))
+
+
 class CliHelp(GeneratedDirective):
     optional_arguments = 1
 
@@ -639,5 +660,6 @@ def setup(app: Sphinx) -> ExtensionMetadata:
     app.add_directive("mode-changes", ModeChanges)
     app.add_directive("failsafes", Failsafes)
     app.add_directive("parameter-tables", ParameterTables)
+    app.add_directive("chaos-modes", ChaosModes)
     app.add_directive("cli-help", CliHelp)
     return {"version": "1", "parallel_read_safe": True}

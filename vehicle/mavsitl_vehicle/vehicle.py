@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mavsitl.codec import Counters
 from mavsitl.dialect import mavlink
@@ -31,6 +31,9 @@ from mavsitl_vehicle.autopilot.wind_estimate import WindEstimate
 from mavsitl_vehicle.links import LinkControl, initial_links
 from mavsitl_vehicle.record import Record
 from mavsitl_vehicle.simulation import Simulation
+
+if TYPE_CHECKING:
+    from mavsitl.chaos import Chaos
 
 PLAN_SCHEMA = 1
 SIGNING_SCHEMA = 1
@@ -105,6 +108,26 @@ class Vehicle:
         self._boot_us = 0
         """The driver's time at which the autopilot booted last."""
         self._done = False
+        self._recorder = recorder
+        self._seed = seed
+        self._chaos: Chaos | None = None
+        if flight.scenario.chaos:
+            self.chaos.schedule(flight.scenario.chaos)
+
+    @property
+    def chaos(self) -> Chaos:
+        """Makes the vehicle misbehave by MAVLink's rules, e.g. ``vehicle.chaos.begin("ack-lost")``."""
+        if self._chaos is None:
+            from mavsitl.chaos import Chaos  # here, for few ask for it
+
+            self._chaos = Chaos(
+                [(port.name, port.node) for port in self.autopilot.ports],
+                self._seed,
+                now_us=max(self._now_us, 0),
+                parameters=frozenset(self.parameters.names),
+                note=lambda text: self._recorder.message(max(self._now_us, 0), mavlink.MAV_SEVERITY_WARNING, text),
+            )
+        return self._chaos
 
     def _load_plan(self, store: Store) -> None:
         content = store.load()
@@ -259,6 +282,8 @@ class Vehicle:
         """Fly from the last step to `now_us`, one control period later, and say what is to be said there."""
         first = self._now_us < 0
         self._now_us = now_us
+        if self._chaos is not None:
+            self._chaos.step(now_us, self.flight_time_s)
         if self.autopilot.reboot_requested and not self._lockstep:
             self._reboot(now_us)
         autopilot, simulation = self.autopilot, self.simulation

@@ -174,7 +174,7 @@ class Autopilot:
         self._now_us = now_us
         several = len(self.ports) > 1
         signed_only = node.signing is not None and node.signing.active
-        for frame in frames:
+        for frame in frames if node.tamper is None else node.tamper.incoming(frames):
             message = frame.message
             if several and (frame.signed or not signed_only):
                 self._router.note(port_index, (frame.system_id, frame.component_id), now_us)
