@@ -52,6 +52,8 @@ class Outcome:
     lateness_us: tuple[float, float] | None = None
     """p50 and p99 of the tick's lateness; real time only."""
     rebased: int = 0
+    lost: str = ""
+    """How the vehicle was lost in flight; empty: it was not. The ground's to say."""
     link: dict[str, dict[str, float]] | None = None
     """Of an impaired link, by direction: `mavsitl.link.impaired.Statistics`; None of a perfect one, and the ground."""
 
@@ -425,5 +427,6 @@ class _Watch:
             rejected=counters.rejected,
             lateness_us=lateness_us,
             rebased=rebased,
+            lost=getattr(self._core, "lost", ""),
             link=None if channels is None else channels.statistics(),
         )
