@@ -48,9 +48,9 @@ A quadrotor in Dryden wind and an off-board controller, two processes that meet 
 """
 
 EPILOG = """\
-Exit codes: 0 done; 1 the run failed (the message says which end and why); 2 wrong arguments or scenario;
-130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by the terminal's end. A vehicle or a ground in real time runs until it
-is told to end: for these two a signal is the end, and 0. However it ends, logs and state are complete.
+Exit codes: 0 done; 1 the run failed (the message says which end and why) or a vehicle was lost; 2 wrong arguments or
+scenario; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by the terminal's end. A vehicle or a ground in real time runs
+until it is told to end: for these two a signal is the end, and 0. However it ends, logs and state are complete.
 Documentation: docs/index.md. Each command's own --help says more.
 """
 
@@ -655,8 +655,11 @@ def _fly(options: argparse.Namespace) -> int:
                 alone = [other.name for other in flights].count(flight.name) == 1
                 title = flight.name if alone else f"{flight.name}-{index + 1}"
                 task = bar.add_task(f"{title:20s}", total=flight.scenario.duration_s, said="starting")
-                outcome, speed = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task, pair)
-                records.append(runs.record(flight, folder=title, wire_hash=outcome, real_time_factor=speed))
+                flown = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task, pair)
+                wire_hash, speed, lost = flown
+                records.append(
+                    runs.record(flight, folder=title, wire_hash=wire_hash, real_time_factor=speed, lost=lost)
+                )
                 runs.write_run(folder, runs.new_run("mavsitl " + " ".join(sys.argv[1:]), created, tuple(records)))
     except KeyboardInterrupt:
         console.print(f"interrupted; the logs so far are in {folder}")
@@ -666,8 +669,8 @@ def _fly(options: argparse.Namespace) -> int:
 
 def _fly_one(
     name: str, flight: Flight, settings: list[str], folder: Path, memory: bool, bar: RichProgress, task: Any, pair: Any
-) -> tuple[str, float]:
-    """One flight; the hash of its wire and how much faster than real time it went."""
+) -> tuple[str, float, str]:
+    """One flight: the hash of its wire, how much faster than real time it went, and how the vehicle was lost."""
 
     def move(time_s: float) -> None:
         bar.update(task, completed=max(time_s, 0.0), said=f"{max(time_s, 0.0):5.1f} s")
@@ -682,14 +685,17 @@ def _fly_one(
         from mavsitl import ends
 
         outcome = ends.in_memory(flight, folder, report=lambda text: bar.update(task, said=text), progress=move)
-        if not outcome.finished:
+        if not outcome.finished and not outcome.lost:
             raise pair.PairError(f"{flight.name}: the flight did not end as planned")
-        wire_hash, speed = outcome.wire_hash, outcome.speed
+        wire_hash, speed, lost = outcome.wire_hash, outcome.speed, outcome.lost
     else:
         result = pair.fly(name, settings, folder, on_event)
-        wire_hash, speed = result.vehicle["wire_hash"], result.vehicle["speed"]
-    bar.update(task, completed=flight.scenario.duration_s, said=f"{speed:.0f} x real time")
-    return wire_hash, speed
+        wire_hash, speed, lost = result.vehicle["wire_hash"], result.vehicle["speed"], result.ground.get("lost", "")
+    if lost:
+        bar.update(task, said="lost")
+    else:
+        bar.update(task, completed=flight.scenario.duration_s, said=f"{speed:.0f} x real time")
+    return wire_hash, speed, lost
 
 
 def _show(console: Any, options: argparse.Namespace, folder: Path, records: list[FlightRecord]) -> int:
@@ -700,10 +706,13 @@ def _show(console: Any, options: argparse.Namespace, folder: Path, records: list
     from mavsitl.report.metrics import rmse
 
     results = []
+    lost = []
     for record in records:
         data = FlightData.from_folder(folder / record.folder, duration_s=record.duration_s)
         rows = tables.rows(rmse(data), record.paper_case)
         results.append((record, rows))
+        if record.lost:
+            lost.append((record, float(data.time_s[-1])))
     if options.json:
         _print_json(folder, results)
     else:
@@ -729,7 +738,11 @@ def _show(console: Any, options: argparse.Namespace, folder: Path, records: list
         page = write_report(folder)
         console.print(f"report: {page}", soft_wrap=True, highlight=False)
     console.print(f"logs:   {folder}", soft_wrap=True, highlight=False)
-    return EXIT_OK
+    for record, end_s in lost:
+        console.print(
+            f"[bold red]{record.name} was lost after {end_s:.1f} s:[/] {record.lost}", soft_wrap=True, highlight=False
+        )
+    return EXIT_FAILED if lost else EXIT_OK
 
 
 def _loud(source: str) -> str:
@@ -790,6 +803,7 @@ class _Status:
                 **({} if outcome.lateness_us is None else {
                     "lateness_us": outcome.lateness_us, "rebased": outcome.rebased, "lost_s": outcome.lost_s,
                 }),
+                **({"lost": outcome.lost} if outcome.lost else {}),
                 "dropped": outcome.dropped, **outcome.links,
             })  # fmt: skip
             return
@@ -797,6 +811,8 @@ class _Status:
             f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time; "
             f"{outcome.frames} frames in"
         )
+        if outcome.lost:
+            print(f"lost: {outcome.lost}")
         if outcome.dropped:
             print("dropped: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
         for place, directions in outcome.links.items():

@@ -60,6 +60,8 @@ class Outcome:
     """How often the schedule was moved, the machine being too slow or the process suspended."""
     lost_s: float = 0.0
     """Wall time given up by that."""
+    lost: str = ""
+    """How the vehicle was lost in flight; empty: it was not. The ground's to say."""
     links: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
     """Of the vehicle's impaired links ("link", "gcs_link", "tcp_link"), by direction:
     `mavsitl.link.impaired.Statistics`."""
@@ -568,6 +570,7 @@ class _Watch:
             lateness_us=None if timing is None else (timing.lateness.p50_us, timing.lateness.p99_us),
             rebased=0 if timing is None else timing.rebased,
             lost_s=0.0 if timing is None else timing.lost_us / 1e6,
+            lost=getattr(self._core, "lost", ""),
             links=links or {},
             dropped={name: count for name, count in dropped.items() if count and name not in _KEPT},
         )

@@ -131,6 +131,15 @@ class Node:
         """Queue another component's frame as it is, with its sequence number and signature."""
         self._outbox.append(frame)
 
+    @property
+    def queued(self) -> int:
+        """Frames that wait for `datagrams`."""
+        return len(self._outbox)
+
+    def lose(self, kept: int) -> None:
+        """Drop the queued frames but the first `kept`, as a link does that is down: their numbers are used."""
+        del self._outbox[kept:]
+
     def datagrams(self, max_bytes: int = DATAGRAM_BYTES, combine: bool = False) -> list[bytes]:
         """Take the queued frames as datagrams, in order.
 

@@ -103,7 +103,7 @@ def _start(arguments: list[str]) -> subprocess.Popen[bytes]:
 
 
 def _follow(processes: dict[str, subprocess.Popen[bytes]], on_event: OnEvent) -> Result:
-    """Read both ends' events until both have ended well or one has failed."""
+    """Read both ends' events until both have ended or one has failed. A lost vehicle is an end, too."""
     result = Result()
     errors = dict.fromkeys(processes, b"")
     with selectors.DefaultSelector() as selector:
@@ -119,7 +119,8 @@ def _follow(processes: dict[str, subprocess.Popen[bytes]], on_event: OnEvent) ->
                 if not chunk:
                     selector.unregister(key.fileobj)
                     open_streams -= 1
-                    if kind == "out" and processes[end].wait() != 0:
+                    ended_well = kind != "out" or processes[end].wait() == 0 or getattr(result, end).get("lost")
+                    if not ended_well:
                         _drain(processes[end], errors, end)
                         said = errors[end].decode(errors="replace").strip() or "the flight did not end as planned"
                         blame = ScenarioError if processes[end].returncode == EXIT_USAGE else PairError

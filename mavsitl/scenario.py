@@ -229,6 +229,27 @@ class ChaosWindow(Section, frozen=True):
     """Of `start_s`: since the release or the lift-off, or since the vehicle's start."""
 
 
+class Failure(Section, frozen=True):
+    """A part of the vehicle fails at `start_s`: what MAV_CMD_INJECT_FAILURE does, by the scenario's time line.
+
+    Which `type` each `unit` knows is in the reference of failures.
+    """
+
+    unit: Literal["gyro", "accel", "mag", "baro", "gps", "battery", "motor", "rc", "mavlink"]
+    """FAILURE_UNIT"""
+    type: Literal["off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"]
+    """FAILURE_TYPE"""
+    start_s: NonNegative
+    instance: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """Counted from 1; 0: all."""
+    duration_s: NonNegative = 0.0
+    """0: it stays."""
+    clock: Literal["flight", "simulated"] = "flight"
+    """Of `start_s`: since the release or the lift-off, or since the vehicle's start."""
+    value: float | None = None
+    """How much, where the reference has a number for it; else its default."""
+
+
 class Hover(Section, frozen=True, tag_field="kind", tag="hover"):
     position_nwu_m: Vector3 = (0.0, 0.0, 1.0)
     yaw_deg: float = 0.0
@@ -356,6 +377,8 @@ class Scenario(Section, frozen=True):
     """Each of the ground stations' links, over UDP and TCP; there is none in lock-step."""
     chaos: tuple[ChaosWindow, ...] = ()
     """What the vehicle does wrong on its MAVLink ports."""
+    failures: tuple[Failure, ...] = ()
+    """What breaks, and when."""
     parameters: dict[str, float] = {}
     """PX4 parameters of the vehicle, over the airframe's."""
     controller: Controller = Controller()

@@ -6,7 +6,7 @@ Sans-IO.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import exp, radians, sqrt
+from math import acos, cos, degrees, exp, radians, sqrt
 from typing import Any
 
 import numpy as np
@@ -45,6 +45,12 @@ STATE_MESSAGES = {
     "split": (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED),
 }
 SYS_STATE_INTERVAL_US = 200_000
+
+CRASHED_HEIGHT_M = 0.5
+CRASHED_TILT_COS = cos(radians(60.0))
+CRASHED_BELOW_M = 1.0
+CRASHED_TIME_US = 1_000_000
+"""So long, over ground, lower than that, and tilted beyond that or so far below the reference though it has flown."""
 
 
 class Controller:
@@ -255,6 +261,8 @@ class Ground:
         self._hover_thrust = 1.0 / flight.airframe.thrust_to_weight
         self._max_thrust_n = flight.airframe.max_thrust_n
         self._released_us: int | None = None
+        self._down_since_us: int | None = None
+        self._has_flown = False
         self._heartbeat_us = -HEARTBEAT_INTERVAL_US
         self._record = _Record(
             recorder, flight, with_weights=self._level != "attitude" and self._controller.weights is not None
@@ -272,6 +280,11 @@ class Ground:
     @property
     def succeeded(self) -> bool:
         return self._handshake.phase is Phase.DONE
+
+    @property
+    def lost(self) -> str:
+        """How the vehicle was lost in flight; empty: it was not."""
+        return self._handshake.lost
 
     @property
     def flight_time_s(self) -> float:
@@ -296,7 +309,9 @@ class Ground:
             if type(message).id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
                 handshake.on_heartbeat(message, frame.system_id, frame.component_id, self._now_us)
             elif handshake.accepts(frame.system_id, frame.component_id):
+                stamp_us = self._observer.stamp_us
                 self._observer.receive(message)
+                handshake.clock_goes_on = handshake.clock_goes_on or self._observer.stamp_us > stamp_us
                 handshake.on_message(message, self._now_us)
                 if type(message).id == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
                     sender = (frame.system_id, frame.component_id)
@@ -323,6 +338,8 @@ class Ground:
             self._released_us = state.stamp_us
         if state.fresh and state.valid(now_us):
             state.take()
+            if self._scenario.ground_contact:
+                self._watch_crash(now_us)
             self._control(now_us)
         if now_us - self._heartbeat_us >= HEARTBEAT_INTERVAL_US and not self.finished:
             self._heartbeat_us = now_us
@@ -363,6 +380,26 @@ class Ground:
         self._record.write(now_us, state, controller, thrust, self._node.counters, lost)
         if handshake.phase is Phase.FLY and time_s >= self._scenario.duration_s:
             handshake.finish(now_us)
+
+    def _watch_crash(self, now_us: int) -> None:
+        state, handshake = self._observer, self._handshake
+        height_m = float(state.position_nwu_m[2, 0])
+        low = height_m < CRASHED_HEIGHT_M
+        flies = handshake.phase is Phase.FLY
+        self._has_flown = flies and (self._has_flown or height_m > CRASHED_HEIGHT_M + CRASHED_BELOW_M)
+        if not low or handshake.lost or not (flies or handshake.phase is Phase.STOP):
+            self._down_since_us = None
+            return
+        phi, theta, _ = state.angles_rad[:, 0].tolist()
+        upright = cos(phi) * cos(theta)
+        below_m = self._controller.reference[0][2] - height_m
+        if not (upright < CRASHED_TILT_COS or (self._has_flown and below_m > CRASHED_BELOW_M)):
+            self._down_since_us = None
+        elif self._down_since_us is None:
+            self._down_since_us = state.stamp_us
+        elif state.stamp_us - self._down_since_us >= CRASHED_TIME_US:
+            text = f"the vehicle is on the ground, {below_m:.1f} m below its reference"
+            handshake.crash(f"{text}, tilted by {degrees(acos(upright)):.0f} deg", now_us)
 
     def _send_idle(self, target: tuple[int, int], thrust: float) -> None:
         """Before the flight and while not in control: level, no rates; it keeps the stream, and lock-step, going."""

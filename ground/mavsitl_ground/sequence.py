@@ -1,7 +1,8 @@
 """The handshake that brings a vehicle into OFFBOARD and back: one table of phases, stepped with the time.
 
 SEARCH -> CONNECT -> STREAM -> OFFBOARD -> ARM -> RELEASE -> FLY -> STOP -> DONE; a silent or restarted vehicle leads
-back to SEARCH from anywhere, a vehicle that somebody else disarmed in flight to ABORTED.
+back to SEARCH from anywhere, a vehicle that somebody else disarmed in flight to ABORTED, one that has crashed by STOP to
+LOST.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ STREAM_TIME_US = 500_000
 RETRY_US = 1_000_000
 """After a refusal."""
 DISARMED_TIME_US = 500_000
-"""A vehicle disarmed in flight for so long was disarmed by somebody; a restarted one shows its clock before."""
+"""A vehicle disarmed in flight for so long was disarmed by somebody; a restarted one shows its clock before, and one
+whose clock is seen to go on has not restarted.
+"""
 STOP_TIME_US = 120_000_000
 """Longest wait for the vehicle to land and disarm."""
 FORCE_DISARM = 21196.0
@@ -39,9 +42,10 @@ class Phase(Enum):
     STOP = auto()
     DONE = auto()
     ABORTED = auto()
+    LOST = auto()
 
 
-ENDED = (Phase.DONE, Phase.ABORTED)
+ENDED = (Phase.DONE, Phase.ABORTED, Phase.LOST)
 
 
 class Handshake:
@@ -78,6 +82,10 @@ class Handshake:
         self._heard_us = -1
         self._disarmed_us: int | None = None
         self.phase = Phase.SEARCH
+        self.lost = ""
+        """How the vehicle was lost in flight; empty: it was not."""
+        self.clock_goes_on = False
+        """Of the vehicle, since its last HEARTBEAT."""
         self.target: tuple[int, int] | None = None
         self.armed = False
         self.offboard = False
@@ -104,6 +112,7 @@ class Handshake:
         if self.target != (system_id, component_id):
             return
         self._heard_us = now_us
+        self.clock_goes_on = False
         self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         self.offboard = message.custom_mode >> 16 & 0xFF == PX4_MAIN_MODE_OFFBOARD
 
@@ -125,6 +134,14 @@ class Handshake:
         self.armed = self.offboard = False
         self.landed_state = mavlink.MAV_LANDED_STATE_UNDEFINED
         self._enter(Phase.SEARCH, now_us)
+
+    def crash(self, how: str, now_us: int) -> None:
+        """The vehicle will not fly any more: stop its rotors where it lies."""
+        self.lost = how
+        self._report(f"crashed: {how}")
+        self._land = False
+        self._client.cancel()
+        self._enter(Phase.STOP, now_us)
 
     def finish(self, now_us: int) -> None:
         """The flight's time is over."""
@@ -204,14 +221,15 @@ class Handshake:
             self._disarmed_us = None
         elif self._disarmed_us is None:
             self._disarmed_us = now_us
-        elif now_us - self._disarmed_us >= DISARMED_TIME_US:
-            self._report("the vehicle was disarmed in flight")
+        if self._disarmed_us is not None and (self.clock_goes_on or now_us - self._disarmed_us >= DISARMED_TIME_US):
+            self.lost = "the vehicle was disarmed in flight"
+            self._report(self.lost)
             self._enter(Phase.ABORTED, now_us)
 
     def _stop(self, now_us: int) -> None:
         if not self.armed:
             self._client.cancel()
-            self._enter(Phase.DONE, now_us)
+            self._enter(Phase.LOST if self.lost else Phase.DONE, now_us)
         elif now_us - self._phase_us >= STOP_TIME_US:
             self._report(f"the vehicle did not disarm within {STOP_TIME_US / 1e6:g} s")
             self._enter(Phase.ABORTED, now_us)
@@ -249,4 +267,5 @@ _STEPS: dict[Phase, Callable[[Handshake, int], None]] = {
     Phase.STOP: Handshake._stop,
     Phase.DONE: Handshake._nothing,
     Phase.ABORTED: Handshake._nothing,
+    Phase.LOST: Handshake._nothing,
 }

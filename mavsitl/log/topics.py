@@ -1,7 +1,8 @@
 """The ULog topics that the vehicle and the ground write: one table, one row layout each.
 
 Topics with a PX4 name keep PX4's field names and its frames, NED and FRD. `control_demand`, `pidnn_weights`,
-`rotor_status` and `link_status` have no counterpart in PX4; they keep the paper's frame, NWU and FLU.
+`rotor_status`, `injected_failure` and `link_status` have no counterpart in PX4; they keep the paper's frame, NWU and
+FLU.
 """
 
 from __future__ import annotations
@@ -126,6 +127,8 @@ RATES_SETPOINT = Topic("vehicle_rates_setpoint", ("float roll", "float pitch", "
 VEHICLE_STATUS = Topic("vehicle_status", ("uint8_t arming_state", "uint8_t nav_state", "uint8_t failsafe"))
 LAND_DETECTED = Topic("vehicle_land_detected", ("uint8_t landed", "uint8_t ground_contact"))
 """Written at every change; the first row with landed = 0 is the release."""
+INJECTED_FAILURE = Topic("injected_failure", ("uint8_t unit", "uint8_t instance", "uint8_t type", "float value"))
+"""Written at every change: FAILURE_UNIT, the instance from 1, FAILURE_TYPE, and its size or NaN."""
 
 TELEMETRY_STATUS = tuple(
     Topic(
@@ -187,6 +190,7 @@ VEHICLE_TOPICS = (
     PIDNN_WEIGHTS,
     *TELEMETRY_STATUS,
     *(topic for directions in CHANNELS.values() for topic in directions.values()),
+    INJECTED_FAILURE,
 )
 GROUND_TOPICS = (TRAJECTORY_SETPOINT, ATTITUDE_SETPOINT, CONTROL_DEMAND, PIDNN_WEIGHTS, LINK_STATUS)
 TOPICS = tuple(dict.fromkeys(VEHICLE_TOPICS + GROUND_TOPICS))

@@ -40,6 +40,8 @@ class FlightRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """The key of `PAPER_TABLES` that the flight answers to."""
     wind: tuple[str, ...] = ()
     """Wind models; empty in calm air."""
+    lost: str = ""
+    """How the vehicle was lost in flight; empty: it was not."""
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -54,7 +56,9 @@ def new_run(command: str, created_utc: str, flights: tuple[FlightRecord, ...]) -
     return Run(version=mavsitl.__version__, command=command, created_utc=created_utc, flights=flights)
 
 
-def record(flight: Flight, *, folder: str, wire_hash: str, real_time_factor: float | None) -> FlightRecord:
+def record(
+    flight: Flight, *, folder: str, wire_hash: str, real_time_factor: float | None, lost: str = ""
+) -> FlightRecord:
     """What `run.json` says of a flight."""
     scenario = flight.scenario
     return FlightRecord(
@@ -74,6 +78,7 @@ def record(flight: Flight, *, folder: str, wire_hash: str, real_time_factor: flo
         duration_s=scenario.duration_s,
         paper_case=paper_case(scenario),
         wind=tuple(str(model.__struct_config__.tag) for model in scenario.wind),
+        lost=lost,
     )
 
 

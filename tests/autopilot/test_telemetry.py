@@ -82,6 +82,7 @@ class Told:
     truth: Sequence[float] = (*STATE, 100.0, 200.0, 300.0, 400.0)
     true_wind: Vector = (0.0, 0.0, 0.5)
     outputs: Sequence[float] = (0.1, 0.2, 0.3, 0.4)
+    silent_escs: int = 0
     origin: Origin = field(default_factory=lambda: Origin(47.397742, 8.545594, 488.0))
     home: Home | None = field(default_factory=lambda: Home((10.0, 20.0, 1.0), pi / 2.0, 1000))
     attitude_target: AttitudeTarget | None = field(

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from enum import IntEnum
+from math import inf, isfinite, nan
 from typing import NamedTuple
 
 from mavsitl.dialect import mavlink
+from mavsitl.scenario import Failure, Flight, LinkModel, Scenario, ScenarioError
 
 
 class Unit(IntEnum):
@@ -46,8 +48,96 @@ SENSORS = frozenset((Unit.GYRO, Unit.ACCEL, Unit.MAG, Unit.BARO, Unit.GPS))
 INSTANCES = {Unit.MOTOR: 4, Unit.MAVLINK: 2}
 """Of a unit; any other has one. The link's are 1 off-board, 2 ground stations."""
 
-TABLE: Mapping[tuple[Unit, Kind], str] = {}
+TABLE: Mapping[tuple[Unit, Kind], str] = {
+    (Unit.BATTERY, Kind.OFF): "It reads empty, as PX4's simulated battery does; the rotors turn on.",
+    (Unit.BATTERY, Kind.STUCK): "Charge, voltage and current stay as last measured, while the pack drains on.",
+    (Unit.BATTERY, Kind.WRONG): "It collapses: charge and voltage fall at once. Well again, it has what it would have.",
+    (Unit.MOTOR, Kind.OFF): "The rotor stands still. Its speed controller reports no speed.",
+    (Unit.MOTOR, Kind.STUCK): "The rotor keeps its speed while armed. Its speed controller reports nothing any more.",
+    (Unit.MOTOR, Kind.GARBAGE): "The rotor turns at any speed, another one every 0.1 s while armed.",
+    (Unit.MOTOR, Kind.WRONG): "The rotor is too slow, so that it has a share of its thrust and of its drag torque.",
+    (Unit.MOTOR, Kind.SLOW): "The rotor follows its command with a lag, on top of the airframe's.",
+    (Unit.MOTOR, Kind.INTERMITTENT): "The rotor cuts out, for 0.1 s on average and every second on average.",
+    (Unit.RC, Kind.OFF): "MANUAL_CONTROL is not heard.",
+    (Unit.RC, Kind.STUCK): "The sticks stay as they were and count as fresh, whatever comes.",
+    (Unit.MAVLINK, Kind.OFF): "Nothing comes in and nothing goes out.",
+    (
+        Unit.MAVLINK,
+        Kind.STUCK,
+    ): "Telemetry repeats the state of the moment under new time stamps. Mode, arming, texts and answers stay true.",
+}
 """What each supported combination does."""
+
+
+class Size(NamedTuple):
+    """How much of a failure, where that is a number."""
+
+    default: float
+    minimum: float
+    maximum: float
+    text: Callable[[float], str]
+
+
+SIZES: Mapping[tuple[Unit, Kind], Size] = {
+    (Unit.BATTERY, Kind.WRONG): Size(0.04, 0.0, 1.0, lambda share: f"{100.0 * share:g} % of the charge"),
+    (Unit.MOTOR, Kind.WRONG): Size(0.5, 0.0, 1.0, lambda share: f"{100.0 * share:g} % of the thrust"),
+    (Unit.MOTOR, Kind.SLOW): Size(0.1, 0.001, 10.0, lambda tau_s: f"time constant {tau_s:g} s"),
+}
+"""The others have no number."""
+
+PARAMETERS: Mapping[str, tuple[Unit, int]] = {
+    "SIM_FAIL_GYRO": (Unit.GYRO, 1),
+    "SIM_FAIL_ACC": (Unit.ACCEL, 1),
+    "SIM_FAIL_MAG": (Unit.MAG, 1),
+    "SIM_FAIL_BARO": (Unit.BARO, 1),
+    "SIM_FAIL_GPS": (Unit.GPS, 1),
+    "SIM_FAIL_BAT": (Unit.BATTERY, 1),
+    **{f"SIM_FAIL_MOT{motor}": (Unit.MOTOR, motor) for motor in range(1, 5)},
+    "SIM_FAIL_RC": (Unit.RC, 1),
+    "SIM_FAIL_LINK1": (Unit.MAVLINK, 1),
+    "SIM_FAIL_LINK2": (Unit.MAVLINK, 2),
+}
+"""The parameter that shows and sets the failure of each instance."""
+
+EFFICIENCIES: Mapping[str, int] = {f"SIM_MOT{motor}_EFF": motor for motor in range(1, 5)}
+"""The parameter that shows and sets each motor's share of thrust: 1 is `OK`, 0 is `OFF`, between is `WRONG`."""
+
+
+def kinds(unit: Unit) -> tuple[Kind, ...]:
+    """The failures that a unit may have, `OK` first."""
+    return (Kind.OK, *(kind for other, kind in TABLE if other is unit))
+
+
+def has_sensors(scenario: Scenario) -> bool:
+    """Does the vehicle estimate its state from sensors, which can fail?"""
+    estimator = getattr(scenario, "estimator", None)
+    return estimator is not None and estimator.kind == "ekf"
+
+
+SILENCE = (Unit.MAVLINK, Kind.OFF)
+NO_SILENCE = "in lock-step it needs an impaired [link]: over a perfect one time goes by telemetry"
+
+
+def may_fall_silent(scenario: Scenario, *, lockstep: bool) -> bool:
+    """Does the peer's clock go on where the vehicle says nothing? If not, `SILENCE` would stop the flight for good."""
+    return not lockstep or scenario.link != LinkModel()
+
+
+def unsupported(unit: int, kind: int, *, sensors: bool) -> str | None:
+    """Why there is no such failure, by the numbers of FAILURE_UNIT and FAILURE_TYPE; None where there is."""
+    if unit not in Unit.__members__.values() or kind not in Kind.__members__.values():
+        return f"unit {unit} type {kind} is not supported"
+    if Unit(unit) in SENSORS and not sensors:
+        return f'{named(Unit(unit))} needs estimator.kind = "ekf"'
+    if (known := kinds(Unit(unit))) == (Kind.OK,) or kind not in known:
+        allowed = ", ".join(f"{each.value} {named(each)}" for each in known) if len(known) > 1 else "none"
+        return f"{named(Unit(unit))} {named(Kind(kind))} is not supported; allowed: {allowed}"
+    return None
+
+
+def named(item: Unit | Kind) -> str:
+    """As the scenario writes it."""
+    return item.name.lower()
 
 
 class Change(NamedTuple):
@@ -56,6 +146,17 @@ class Change(NamedTuple):
     unit: Unit
     instance: int
     kind: Kind
+    value: float = nan
+    """How much, where the failure has a size."""
+
+    @property
+    def text(self) -> str:
+        """For people: "Failure injected: motor 2 off"."""
+        what = named(self.unit) + (f" {self.instance}" if INSTANCES.get(self.unit, 1) > 1 else "")
+        if self.kind is Kind.OK:
+            return f"Failure cleared: {what}"
+        size = SIZES.get((self.unit, self.kind))
+        return f"Failure injected: {what} {named(self.kind)}" + (f", {size.text(self.value)}" if size else "")
 
 
 class Failures:
@@ -63,28 +164,128 @@ class Failures:
 
     def __init__(self) -> None:
         self.active: dict[tuple[Unit, int], Kind] = {}
+        self._values: dict[tuple[Unit, int], float] = {}
         self._listeners: list[Callable[[Change], None]] = []
 
     def of(self, unit: Unit, instance: int = 1) -> Kind:
         return self.active.get((unit, instance), Kind.OK)
 
+    def value(self, unit: Unit, instance: int = 1) -> float:
+        """How much of its failure; NaN where that is no number."""
+        return self._values.get((unit, instance), nan)
+
     def subscribe(self, listener: Callable[[Change], None]) -> None:
         self._listeners.append(listener)
 
-    def set(self, unit: Unit, kind: Kind, instance: int = 0) -> None:
-        """`instance` 0: all. Tells the listeners of what changes.
+    def set(self, unit: Unit, kind: Kind, instance: int = 0, value: float | None = None) -> None:
+        """`instance` 0: all. `value`: as in `SIZES`; None: as it is, or the default. Tells the listeners what changes.
 
-        Raises `ValueError` for an instance that the unit does not have.
+        Raises `ValueError` for an instance that the unit does not have, and a value that the failure cannot have.
         """
+        if problem := instance_problem(unit, instance) or (None if value is None else value_problem(unit, kind, value)):
+            raise ValueError(problem)
         count = INSTANCES.get(unit, 1)
-        if not 0 <= instance <= count:
-            raise ValueError(f"{unit.name} has no instance {instance}; allowed: 0 (all) to {count}")
         for each in range(1, count + 1) if instance == 0 else (instance,):
-            if self.of(unit, each) is kind:
+            same = self.of(unit, each) is kind
+            if same and (value is None or value == self.value(unit, each)):
                 continue
-            if kind is Kind.OK:
-                del self.active[unit, each]
-            else:
+            self.active.pop((unit, each), None)
+            self._values.pop((unit, each), None)
+            if kind is not Kind.OK:
                 self.active[unit, each] = kind
+            if size := SIZES.get((unit, kind)):
+                self._values[unit, each] = size.default if value is None else value
+            change = Change(unit, each, kind, self.value(unit, each))
             for listener in self._listeners:
-                listener(Change(unit, each, kind))
+                listener(change)
+
+    def clear(self) -> None:
+        """All is well again."""
+        for unit, instance in tuple(self.active):
+            self.set(unit, Kind.OK, instance)
+
+
+def instance_problem(unit: Unit, instance: int) -> str | None:
+    """Why a unit has no such instance; None where it has. 0 is all of them."""
+    count = INSTANCES.get(unit, 1)
+    if 0 <= instance <= count:
+        return None
+    return f"{named(unit)} has no instance {instance}; allowed: 0 (all) to {count}"
+
+
+def value_problem(unit: Unit, kind: Kind, value: float) -> str | None:
+    """Why a failure is not of this size; None where it may be."""
+    size = SIZES.get((unit, kind))
+    if size is None:
+        return f"{named(unit)} {named(kind)} has no value"
+    if isfinite(value) and size.minimum <= value <= size.maximum:
+        return None
+    return f"{value:g} is not allowed for {named(unit)} {named(kind)}; allowed: {size.minimum:g} to {size.maximum:g}"
+
+
+# --- the scenario's time line ----------------------------------------------------------------------------------------
+
+
+class Timeline:
+    """Injects the scenario's failures when their time comes, and clears them when it is over."""
+
+    def __init__(self, flight: Flight, failures: Failures, *, lockstep: bool) -> None:
+        """Raises `ScenarioError` for a failure that there is not."""
+        self._failures = failures
+        self._planned = [_Planned(flight, number, lockstep) for number in range(len(flight.scenario.failures))]
+        self._last_flight_s = -1.0
+
+    def __bool__(self) -> bool:
+        return bool(self._planned)
+
+    def step(self, now_us: int, flight_time_s: float) -> None:
+        """What begins or ends by `now_us` since the start; the flight's time is negative before the release."""
+        if flight_time_s < 0.0 <= self._last_flight_s:
+            for planned in self._planned:
+                planned.done = planned.done and planned.asked.clock == "simulated"
+        self._last_flight_s = flight_time_s
+        for planned in self._planned:
+            if planned.ends_us <= now_us:
+                planned.ends_us = inf
+                self._end(planned)
+            if planned.done:
+                continue
+            asked = planned.asked
+            time_s = flight_time_s if asked.clock == "flight" else now_us * 1e-6
+            if time_s + _HALF_US >= asked.start_s and time_s >= 0.0:
+                planned.done = True
+                if asked.duration_s:
+                    planned.ends_us = now_us + asked.duration_s * 1e6 - 0.5
+                self._failures.set(planned.unit, planned.kind, asked.instance, asked.value)
+
+    def _end(self, planned: _Planned) -> None:
+        """What somebody else has changed since stays as it is."""
+        instances = range(1, INSTANCES.get(planned.unit, 1) + 1)
+        for each in instances if planned.asked.instance == 0 else (planned.asked.instance,):
+            if self._failures.of(planned.unit, each) is planned.kind:
+                self._failures.set(planned.unit, Kind.OK, each)
+
+
+_HALF_US = 0.5e-6
+
+
+class _Planned:
+    """One entry of `[[failures]]`: as it was asked for, and how far it has come."""
+
+    def __init__(self, flight: Flight, number: int, lockstep: bool) -> None:
+        self.asked: Failure = flight.scenario.failures[number]
+        self.unit = Unit[self.asked.unit.upper()]
+        self.kind = Kind[self.asked.type.upper()]
+        self.done = False
+        """In this flight; by the clock of the simulation: ever."""
+        self.ends_us = inf
+        where = f"{flight.name}: failures[{number}]"
+        if problem := unsupported(self.unit, self.kind, sensors=has_sensors(flight.scenario)):
+            raise ScenarioError(f"{where}.type: {problem}")
+        if (self.unit, self.kind) == SILENCE and not may_fall_silent(flight.scenario, lockstep=lockstep):
+            raise ScenarioError(f"{where}.type: mavlink off: {NO_SILENCE}")
+        if problem := instance_problem(self.unit, self.asked.instance):
+            raise ScenarioError(f"{where}.instance: {problem}")
+        value = self.asked.value
+        if value is not None and (problem := value_problem(self.unit, self.kind, value)):
+            raise ScenarioError(f"{where}.value: {problem}")

@@ -15,6 +15,7 @@ from mavsitl.scenario import Flight
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot import modes
 from mavsitl_vehicle.autopilot.modes import Mode
+from mavsitl_vehicle.failures import Change
 
 if TYPE_CHECKING:
     from mavsitl_vehicle.vehicle import Vehicle
@@ -59,10 +60,19 @@ class Record:
         self._weights = recorder.topic(topics.PIDNN_WEIGHTS) if aboard else None
         self._status = recorder.topic(topics.VEHICLE_STATUS)
         self._land = recorder.topic(topics.LAND_DETECTED)
+        self._failures = recorder.topic(topics.INJECTED_FAILURE)
         self._recorder = recorder
         self._ports_due_us = 0
         self._last_status: tuple[bool, Mode, bool] | None = None
         self._last_land: int | None = None
+
+    def failed(self, now_us: int, severity: int, change: Change) -> None:
+        """A failure was injected or cleared."""
+        self._recorder.message(now_us, severity, change.text)
+        self._failures.append(now_us, change.unit, change.instance, change.kind, change.value)
+
+    def note(self, now_us: int, severity: int, text: str) -> None:
+        self._recorder.message(now_us, severity, text)
 
     def write(self, now_us: int, vehicle: Vehicle) -> None:
         simulation, autopilot = vehicle.simulation, vehicle.autopilot

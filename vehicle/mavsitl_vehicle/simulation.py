@@ -10,10 +10,12 @@ import numpy as np
 from mavsitl import seeds
 from mavsitl.frames import Vector
 from mavsitl.quaternion import conjugate, rotate, to_euler
-from mavsitl.scenario import DrydenMil, Flight, Steady, Wind
+from mavsitl.scenario import DrydenMil, Flight, Gust, Steady, Wind
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot.parameters import Parameters
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint
+from mavsitl_vehicle.failures import Failures
+from mavsitl_vehicle.motors import MotorFailures
 from mavsitl_vehicle.plant.parameters import plant_parameters
 from mavsitl_vehicle.plant.state import initial_state
 from mavsitl_vehicle.wind.field import WindField, mil_axes
@@ -28,7 +30,10 @@ BLOCK_TICKS = 250
 class Simulation:
     """Arrays have the fleet axis last: `x` (17, n) the truth, `estimate` (13, n) what sensors say, `wind` (3, n)."""
 
-    def __init__(self, flight: Flight, parameters: Parameters, seed: int, n: int = 1) -> None:
+    def __init__(
+        self, flight: Flight, parameters: Parameters, seed: int, n: int = 1, failures: Failures | None = None
+    ) -> None:
+        """`failures`: of vehicle 0's motors; None: none ever."""
         scenario = flight.scenario
         self.n = n
         self._flight = flight
@@ -50,6 +55,9 @@ class Simulation:
         self._velocity = self.x[3:6].copy()
         """At the beginning of the tick."""
         self._command = np.zeros((4, n))
+        self.motors = MotorFailures(Failures() if failures is None else failures, seed, self.dt_s, self.gains, n)
+        self._gust: Gust | None = None
+        self._stalled_inner: tick.Array | None = None
         self._wind_generators = [seeds.generator(seed, "vehicle", j, "wind") for j in range(n)]
         self._sensor_generators = [seeds.generator(seed, "vehicle", j, "sensors") for j in range(n)]
         per_reset = self.field.normals_for_reset
@@ -152,6 +160,25 @@ class Simulation:
         field.state[:kept] = self.field.state[:kept]
         field.state[kept:] = extra.state
         self.field = field
+        if self._gust is not None:
+            field.add(self._gust)
+
+    def blow(self, gust: Gust | None) -> None:
+        """A gust on top of everything else, in place of the one before; None: it is over."""
+        if self._gust is not None:
+            self.field.drop_last()
+        self._gust = gust
+        if gust is not None:
+            self.field.add(gust)
+
+    def stall(self, stalled: bool) -> None:
+        """The inner loops stand still: the rotors keep what they were commanded last."""
+        if stalled:
+            self._stalled_inner = self.inner.copy()
+            self.motors.hold(self._command[:, 0])
+        elif self._stalled_inner is not None:
+            self.inner[:], self._stalled_inner = self._stalled_inner, None
+            self.motors.hold(None)
 
     def advance(self, flight_time_s: float) -> None:
         """One control period: the inner loops and the physics at the physics rate, then the sensors.
@@ -163,9 +190,11 @@ class Simulation:
             self._draw()
         self._velocity[:] = self.x[3:6]
         field = self.field
+        if self.motors.busy:
+            self.motors.step(self._tick * self.substeps * self.dt_s, self.x[13:17, 0])
         tick.advance(
-            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._command,
-            field.state, field.coefficients, self.wind, self._wind_block[row], self._sensor_block[row],
+            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self.motors.rows,
+            self._command, field.state, field.coefficients, self.wind, self._wind_block[row], self._sensor_block[row],
             self.sigma, flight_time_s, self.dt_s, self.substeps,
         )  # fmt: skip
         self._tick += 1
@@ -186,7 +215,8 @@ class Simulation:
         for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
             demand[tick.KIND] = kind
             tick.advance(
-                x, estimate, demand, self.gains, inner, self.held, self.plant, self._command.copy(),
+                x, estimate, demand, self.gains, inner, self.held, self.plant, self.motors.rows.copy(),
+                self._command.copy(),
                 self.field.state.copy(), self.field.coefficients, self.wind.copy(),
                 self._wind_block[0], self._sensor_block[0], self.sigma, 0.0, self.dt_s, self.substeps,
             )  # fmt: skip

@@ -56,6 +56,13 @@ RATE_SETPOINT = 6  # 6:9, rad/s
 SATURATED = 9  # allocation's saturation bits, OR-ed over the tick
 INNER_ROWS = 10
 
+# Rows of `motors` (MOTOR_ROWS, n), what becomes of the commands to rotors 1..4.
+SPEED_SHARE = 0  # 0:4, of the commanded speed
+FIXED_SPEED = 4  # 4:8, rad/s whatever is commanded; NaN: as commanded
+FOLLOW = 8  # 8:12, share of the way to the command that is gone in a physics step; 1: all of it
+COMMANDED = 12  # 12:16, filled in: the allocation's speeds, rad/s
+MOTOR_ROWS = 16
+
 
 @compiled
 def rate_setpoint(demand: Array, estimate: Array, gains: Array, inner: Array, j: int) -> None:
@@ -145,6 +152,23 @@ def inner_loops(
 
 
 @compiled
+def fail_motors(x: Array, demand: Array, motors: Array, command: Array) -> None:
+    """From the allocation's speeds in `command` (4, n) to those that the rotors really get; a stopped one stays so."""
+    for j in range(x.shape[1]):
+        for i in range(4):
+            speed = command[i, j]
+            motors[COMMANDED + i, j] = speed
+            if demand[KIND, j] == STOPPED:
+                continue
+            speed *= motors[SPEED_SHARE + i, j]
+            follow = motors[FOLLOW + i, j]
+            if follow < 1.0:
+                speed = x[13 + i, j] + follow * (speed - x[13 + i, j])
+            fixed = motors[FIXED_SPEED + i, j]
+            command[i, j] = fixed if fixed == fixed else speed
+
+
+@compiled
 def measure(x: Array, sigma: Array, normals: Array, estimate: Array) -> None:
     """Gaussian white noise on every feedback variable: estimate (13, n) from truth and `normals` (12, n).
 
@@ -174,6 +198,7 @@ def advance(
     inner: Array,
     held: NDArray[np.bool_],
     plant: Array,
+    motors: Array,
     command: Array,
     wind_state: Array,
     wind_coefficients: Array,
@@ -202,5 +227,6 @@ def advance(
         wind_step(wind_state, wind_coefficients, normals, time_s + k * dt_s, wind)
         gyro_normals = sensor_normals[k * GYRO_NORMALS : (k + 1) * GYRO_NORMALS]
         inner_loops(x, demand, gains, inner, held, gyro_normals, dt_s, command)
+        fail_motors(x, demand, motors, command)
         rk4_step(x, command, wind, plant, dt_s, held)
     measure(x, sigma, sensor_normals[substeps * GYRO_NORMALS :], estimate)

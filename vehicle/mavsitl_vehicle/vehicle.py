@@ -28,7 +28,9 @@ from mavsitl_vehicle.autopilot.seated import SeatedLaw
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint
 from mavsitl_vehicle.autopilot.storage import Store, keep_parameters
 from mavsitl_vehicle.autopilot.wind_estimate import WindEstimate
+from mavsitl_vehicle.failures import Change, Failures, Kind, Timeline
 from mavsitl_vehicle.links import LinkControl, initial_links
+from mavsitl_vehicle.mishaps import Mishaps
 from mavsitl_vehicle.record import Record
 from mavsitl_vehicle.simulation import Simulation
 
@@ -97,10 +99,13 @@ class Vehicle:
         self._shared = Shared(
             self.parameters, self.plan, card=self._card(state), logs=logs, signing=self._signing, trusted=trusted
         )
-        self.simulation = Simulation(flight, self.parameters, seed)
+        self.failures = Failures()
+        self._timeline = Timeline(flight, self.failures, lockstep=lockstep)
+        self.simulation = Simulation(flight, self.parameters, seed, failures=self.failures)
         self.autopilot = self._boot(0)
         self.links = LinkControl(self.parameters, flight.scenario, lockstep=lockstep)
         self.parameters.subscribe(self._on_parameter)
+        self._mishaps = Mishaps(self)
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
         self._record = Record(recorder, flight, aboard=self._seated is not None)
@@ -128,6 +133,11 @@ class Vehicle:
                 note=lambda text: self._recorder.message(max(self._now_us, 0), mavlink.MAV_SEVERITY_WARNING, text),
             )
         return self._chaos
+
+    @property
+    def name(self) -> str:
+        """The scenario's."""
+        return self._flight.name
 
     def _load_plan(self, store: Store) -> None:
         content = store.load()
@@ -203,7 +213,7 @@ class Vehicle:
         unix_us = 0 if self._unix_us is None else self._unix_us()
         autopilot = Autopilot(
             self._flight, self._system_id, self._port_names, self.parameters, _Body(self.simulation), self._shared,
-            lockstep=self._lockstep, unix_boot_us=unix_us,
+            lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures,
         )  # fmt: skip
         autopilot.estimate = self.simulation.estimate[:, 0].tolist()
         if not self._lockstep:
@@ -267,6 +277,8 @@ class Vehicle:
         What it decides counts from the last tick. `at_us`, between that and the next, is what the services' clock
         shows, TIMESYNC's above all; None: the tick.
         """
+        if self._mishaps.stalled:
+            return 0
         now_us = max(self._now_us - self._boot_us, 0)
         return self.autopilot.receive(port, datagram, now_us, None if at_us is None else at_us - self._boot_us)
 
@@ -281,32 +293,48 @@ class Vehicle:
     def step(self, now_us: int) -> None:
         """Fly from the last step to `now_us`, one control period later, and say what is to be said there."""
         first = self._now_us < 0
+        if self._timeline:
+            self._timeline.step(self._now_us, self.flight_time_s)
         self._now_us = now_us
         if self._chaos is not None:
             self._chaos.step(now_us, self.flight_time_s)
-        if self.autopilot.reboot_requested and not self._lockstep:
+        running = not (self._mishaps.busy and self._mishaps.step(now_us, self.period_us))
+        if running and self.autopilot.reboot_requested and not self._lockstep:
             self._reboot(now_us)
         autopilot, simulation = self.autopilot, self.simulation
         now_us -= self._boot_us
         if not first and now_us:
-            simulation.held[0] = autopilot.land.held
-            setpoint = autopilot.decide(now_us - self.period_us)
-            simulation.set_demand(0, self._inner_law(setpoint))
+            if running:
+                simulation.held[0] = autopilot.land.held
+                setpoint = autopilot.decide(now_us - self.period_us)
+                simulation.set_demand(0, self._inner_law(setpoint))
             released_us = autopilot.land.released_us
             flown_s = -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
             simulation.advance(flown_s)
-        autopilot.estimate = simulation.estimate[:, 0].tolist()
-        if self._wind is not None:
-            self._wind.update(simulation.estimate, simulation.demand[tick.THRUST, 0], not autopilot.on_ground)
-            autopilot.wind = self._wind.value
-        autopilot.observe(now_us)
-        autopilot.report(now_us)
+        if running:
+            autopilot.estimate = simulation.estimate[:, 0].tolist()
+            if self._wind is not None:
+                self._wind.update(simulation.estimate, simulation.demand[tick.THRUST, 0], not autopilot.on_ground)
+                autopilot.wind = self._wind.value
+            autopilot.observe(now_us)
+            autopilot.report(now_us)
         self._record.write(self._now_us, self)
         if self._signing is not None:
             self._signing.policy.locked = autopilot.commander.armed
         if autopilot.land.released_us is not None and not autopilot.commander.armed:
             self._done = True
             self._after_flight()
+
+    def note_failure(self, change: Change) -> None:
+        """A failure was injected or cleared, whoever asked for it: say so on every link and in the log."""
+        severity = mavlink.MAV_SEVERITY_NOTICE if change.kind is Kind.OK else mavlink.MAV_SEVERITY_WARNING
+        self.autopilot.queue_text(severity, change.text)
+        self._record.failed(max(self._now_us, 0), severity, change)
+
+    def note(self, text: str) -> None:
+        """Something happened to the vehicle: say so on every link and in the log."""
+        self.autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, text)
+        self._record.note(max(self._now_us, 0), mavlink.MAV_SEVERITY_WARNING, text)
 
     def close(self) -> None:
         """Close the files that clients had open. What is `unsaved` afterwards is the last there is to write."""
@@ -333,6 +361,7 @@ class Vehicle:
         if not old.health.upright and old.on_ground:
             self.simulation.set_upright()
         self._boot_us = now_us
+        self._mishaps.mend()
         self.plan.stores.transaction = None  # it counts in the old time
         self.autopilot = self._boot(now_us)
         self.autopilot.land.held = old.land.held
@@ -389,7 +418,7 @@ class _Body:
     @property
     def outputs(self) -> Sequence[float]:
         largest = self._simulation.gains[tick.MAX_ROTOR_SPEED]
-        shares: list[float] = (self._simulation.x[13:17, 0] / largest).tolist()
+        shares: list[float] = (self._simulation.motors.commanded_rad_s / largest).tolist()
         return shares
 
     @property

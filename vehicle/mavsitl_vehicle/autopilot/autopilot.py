@@ -36,7 +36,8 @@ from mavsitl_vehicle.autopilot.setpoints import (
     State,
 )  # fmt: skip
 from mavsitl_vehicle.autopilot.sticks import Axes
-from mavsitl_vehicle.autopilot.telemetry import AttitudeTarget, FlightTimes, Home
+from mavsitl_vehicle.autopilot.telemetry import AttitudeTarget, FlightTimes, Frozen, Home
+from mavsitl_vehicle.failures import INSTANCES, Failures, Kind, Unit, has_sensors, may_fall_silent
 
 LIFT_MARGIN_M = 0.1
 """An off-board position so far above the vehicle asks to leave the ground."""
@@ -83,11 +84,16 @@ class Autopilot:
         *,
         lockstep: bool = False,
         unix_boot_us: int = 0,
+        failures: Failures | None = None,
     ) -> None:
+        """`failures`: what is broken of the battery, the sticks, the links and, by what it is told, the motors."""
         scenario, airframe = flight.scenario, flight.airframe
         self.system_id = system_id
-        self.unix_boot_us = unix_boot_us
+        self.unix_boot_us = self._true_unix_boot_us = unix_boot_us
         self.load = 0.0
+        self.failures = Failures() if failures is None else failures
+        self.has_sensors = has_sensors(scenario)
+        self.may_fall_silent = may_fall_silent(scenario, lockstep=lockstep)
         self.parameters = parameters
         self.body = body
         self.plan = shared.plan
@@ -141,6 +147,7 @@ class Autopilot:
         self._now_us = 0
         self._shown: tuple[Mode, bool, bool, int] | None = None
         self._gcs_us: int | None = None
+        self._links_failed = False
         self._look_us = 0
         self._housekept_us = -HOUSEKEEPING_US
         self._plan_watch = PlanWatch(shared.plan, self.origin, parameters, lambda text: self.warn("mission", text))
@@ -169,6 +176,8 @@ class Autopilot:
         time, `at_us` when the datagram came; None: then.
         """
         port = self.ports[port_index]
+        if port.down:
+            return 0
         node = port.node
         frames = node.receive(datagram)
         self._now_us = now_us
@@ -189,7 +198,8 @@ class Autopilot:
                     self._on_error(error, frame, port)
             if several:
                 for other in self._router.destinations(port_index, frame, now_us):
-                    self.ports[other].forward(message.get_msgbuf(), now_us)
+                    if not self.ports[other].down:
+                        self.ports[other].forward(message.get_msgbuf(), now_us)
         return sum(frame.signed for frame in frames) if signed_only else len(frames)
 
     def _on_error(self, error: Exception, frame: Frame, port: Port) -> None:
@@ -230,7 +240,7 @@ class Autopilot:
                 self._look_us = now_us
 
     def _on_manual_control(self, message: Message, frame: Frame, now_us: int) -> None:
-        if message.target in (0, self.system_id):
+        if message.target in (0, self.system_id) and self.failures.of(Unit.RC) is Kind.OK:
             self.pilot.receive(message, now_us)
 
     def _on_set_mode(self, message: Message, frame: Frame, now_us: int) -> None:
@@ -259,6 +269,22 @@ class Autopilot:
     @property
     def on_ground(self) -> bool:
         return self.land.on_ground
+
+    @property
+    def failed_motors(self) -> int:
+        """As the speed controllers reveal it, bit i - 1 for motor i: no telemetry, or no current while armed."""
+        if not self.failures.active:
+            return 0
+        return self.silent_escs | (self._motors_with(Kind.OFF) if self.commander.armed else 0)
+
+    @property
+    def silent_escs(self) -> int:
+        """Speed controllers without telemetry, bit i - 1 for motor i."""
+        return self._motors_with(Kind.STUCK)
+
+    def _motors_with(self, kind: Kind) -> int:
+        motors = range(1, INSTANCES[Unit.MOTOR] + 1)
+        return sum(1 << motor - 1 for motor in motors if self.failures.of(Unit.MOTOR, motor) is kind)
 
     @property
     def altitude_amsl_m(self) -> float:
@@ -314,6 +340,11 @@ class Autopilot:
         self.home = self.navigator.home = Home(position_nwu_m, yaw_rad, self._now_us)
         self.commander.home_set = True
         self._home_moved = True
+
+    def jump_clock(self, jump_s: float) -> None:
+        """UNIX time, where it is known, is wrong by so much from now on; nothing goes by it but SYSTEM_TIME."""
+        if self._true_unix_boot_us:
+            self.unix_boot_us = self._true_unix_boot_us + round(jump_s * 1e6)
 
     # --- texts -------------------------------------------------------------------------------------------------------
 
@@ -411,6 +442,8 @@ class Autopilot:
         self._now_us = now_us
         self._look_us = now_us + LOOK_US
         setpoint_us, sticks_us, gcs_us = self.setpoint_us, self.pilot.received_us, self._gcs_us
+        if sticks_us is not None and self.failures.of(Unit.RC) is Kind.STUCK:
+            sticks_us = self.pilot.received_us = now_us
         self.commander.step(
             now_us,
             Situation(
@@ -549,13 +582,17 @@ class Autopilot:
         self._housekept_us = now_us
         if self.home is None:
             self.set_home_here()
-        self.battery.update(self.body.rotor_speeds_rad_s, self.commander.armed, HOUSEKEEPING_US / 1e6)
+        self.battery.update(
+            self.body.rotor_speeds_rad_s, self.commander.armed, HOUSEKEEPING_US / 1e6,
+            self.failures.of(Unit.BATTERY), self.failures.value(Unit.BATTERY),
+        )  # fmt: skip
         self._refresh_plan()
         x, y, z = self.estimate[:3]
         self._fence_breach = self._plan_watch.breach((x, y, z))
         mode = modes.TABLE[self.commander.intended]
         self.health = Health(
             battery=self.battery.level < Level.CRITICAL,
+            motors=not self.failed_motors,
             upright=_upright(self.estimate[7], self.estimate[8]),
             home=self.home is not None,
             sticks=self.commander.sticks_fresh(),
@@ -592,8 +629,11 @@ class Autopilot:
         self._shown = shown
         texts, self._texts = self._texts, []
         home_moved, self._home_moved = self._home_moved and not self.lockstep, False
+        if self.failures.active or self._links_failed:
+            self._fail_links()
         for port in self.ports:
             node = port.node
+            waiting = node.queued
             for text in texts:
                 node.send_message(text)
             if changed:
@@ -602,9 +642,22 @@ class Autopilot:
                 if not self.lockstep:
                     telemetry.send_current_mode(self, node, now_us)
             port.step(now_us)
-            port.schedule.run(self, node, now_us)
+            port.schedule.run(port.subject, node, now_us)
             if home_moved:
                 telemetry.request(self, node, mavlink.MAVLINK_MSG_ID_HOME_POSITION, 0, now_us)
+            if port.down:
+                node.lose(waiting)
+
+    def _fail_links(self) -> None:
+        """What counts on each link until the next period: an answer to the command that breaks it still goes."""
+        self._links_failed = False
+        for port in self.ports:
+            kind = self.failures.of(Unit.MAVLINK, port.instance)
+            port.down = kind is Kind.OFF
+            frozen = kind is Kind.STUCK
+            if frozen != isinstance(port.subject, Frozen):
+                port.subject = Frozen(self) if frozen else self
+            self._links_failed = self._links_failed or port.down or frozen
 
 
 def _upright(x: float, y: float) -> bool:

@@ -10,6 +10,7 @@ from math import ceil, sqrt
 from typing import NamedTuple, Protocol
 
 from mavsitl.airframes import Airframe
+from mavsitl_vehicle.failures import Kind
 
 OPEN_CIRCUIT_V = (
     (0.00, 3.30),
@@ -99,8 +100,8 @@ class Battery:
     """One pack. `update` it with the time that passed; disarmed it rests on the charger's power and keeps its charge.
 
     Attributes:
-        charge: 0 to 1.
-        voltage_v, current_a: at the terminals, under load.
+        charge: 0 to 1, as measured: a failure makes it wrong.
+        voltage_v, current_a: at the terminals, under load, as measured.
         consumed_ah, consumed_j: since full.
         settings: replace it when a parameter changes.
     """
@@ -118,6 +119,9 @@ class Battery:
     def refill(self) -> None:
         """A full pack, at rest."""
         self.charge = 1.0
+        self._true_charge = 1.0
+        """What it would have without a failure."""
+        self._failure = Kind.OK
         self.current_a = 0.0
         self.voltage_v = self.cells * open_circuit_v(1.0)
         self.consumed_ah = 0.0
@@ -129,8 +133,29 @@ class Battery:
         """Electrical power of one rotor: drag torque d omega^2 (eq 9) times omega, by the power train's efficiency."""
         return self._drag * rotor_speed_rad_s * rotor_speed_rad_s * abs(rotor_speed_rad_s)
 
-    def update(self, rotor_speeds_rad_s: Sequence[float], armed: bool, dt_s: float) -> None:
-        """Draw the rotors' power and the hotel load for `dt_s`."""
+    def update(
+        self, rotor_speeds_rad_s: Sequence[float], armed: bool, dt_s: float,
+        failure: Kind = Kind.OK, left: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Draw the rotors' power and the hotel load for `dt_s`; `left`: the charge of a pack that is WRONG."""
+        if failure is Kind.OK and self._failure is Kind.OK:
+            self._draw(rotor_speeds_rad_s, armed, dt_s)
+            return
+        if self._failure is Kind.OK:
+            self._true_charge = self.charge
+        self._failure = failure
+        shown = self.charge, self.voltage_v, self.current_a
+        self.charge = self._true_charge
+        self._draw(rotor_speeds_rad_s, armed, dt_s)
+        self._true_charge = self.charge
+        if failure is Kind.STUCK:
+            self.charge, self.voltage_v, self.current_a = shown
+        elif failure is not Kind.OK:
+            lost_v = open_circuit_v(self.charge)
+            self.charge = 0.0 if failure is Kind.OFF else min(left, self.charge)
+            self.voltage_v -= self.cells * (lost_v - open_circuit_v(self.charge))
+
+    def _draw(self, rotor_speeds_rad_s: Sequence[float], armed: bool, dt_s: float) -> None:
         rest_v = open_circuit_v(self.charge)
         if not armed:
             self.current_a = 0.0

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from mavsitl.dialect import mavlink
 from mavsitl.services.command import Command
 from mavsitl.wire_units import from_deg_e7
+from mavsitl_vehicle import failures
 from mavsitl_vehicle.autopilot import modes, telemetry
 from mavsitl_vehicle.autopilot.commander import (
     ACCEPTED,
@@ -21,6 +22,7 @@ from mavsitl_vehicle.autopilot.commander import (
     UNSUPPORTED,
 )  # fmt: skip
 from mavsitl_vehicle.autopilot.modes import Mode
+from mavsitl_vehicle.failures import Kind, Unit
 
 if TYPE_CHECKING:
     from mavsitl_vehicle.autopilot.autopilot import Autopilot
@@ -336,14 +338,14 @@ def _request_message(autopilot: Autopilot, command: Command, now_us: int, port: 
     if message_id == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL and index is not None and 0 <= index <= 65535:
         send_interval(port, index)
         return ACCEPTED
-    if message_id is None or not telemetry.request(autopilot, port.node, message_id, index or 0, now_us):
+    if message_id is None or not telemetry.request(port.subject, port.node, message_id, index or 0, now_us):
         return _deny(autopilot, f"Request refused: message {command.params[0]:g} is not served")
     return ACCEPTED
 
 
 def _request_one(message_id: int) -> Handler:
     def handler(autopilot: Autopilot, command: Command, now_us: int, port: Port) -> int:
-        if not telemetry.request(autopilot, port.node, message_id, 0, now_us):
+        if not telemetry.request(port.subject, port.node, message_id, 0, now_us):
             return _deny(autopilot, f"Request refused: message {message_id} is not served")
         return ACCEPTED
 
@@ -399,8 +401,21 @@ def _prearm_checks(autopilot: Autopilot, command: Command, now_us: int, port: Po
 def _inject_failure(autopilot: Autopilot, command: Command, now_us: int, port: Port) -> int:
     if not autopilot.parameters["SYS_FAILURE_EN"]:
         return _deny(autopilot, "Failure injection refused: SYS_FAILURE_EN is 0")
-    unit, kind = command.params[0], command.params[1]
-    return _deny(autopilot, f"Failure injection refused: unit {unit:g} type {kind:g} is not supported", UNSUPPORTED)
+    unit, kind, instance = (command.integer(index) for index in (1, 2, 3))
+    if unit is None or kind is None or instance is None:
+        needed = ("a FAILURE_UNIT", "a FAILURE_TYPE", "an instance, 0 for all")
+        index = next(index for index in (1, 2, 3) if command.integer(index) is None)
+        value = command.params[index - 1]
+        return _deny(autopilot, f"Failure injection refused: param{index} is {value:g}, need {needed[index - 1]}")
+    if problem := failures.unsupported(unit, kind, sensors=autopilot.has_sensors):
+        return _deny(autopilot, f"Failure injection refused: {problem}", UNSUPPORTED)
+    problem = failures.instance_problem(Unit(unit), instance)
+    if (unit, kind) == failures.SILENCE and not autopilot.may_fall_silent:
+        problem = failures.NO_SILENCE
+    if problem:
+        return _deny(autopilot, f"Failure injection refused: {problem}")
+    autopilot.failures.set(Unit(unit), Kind(kind), instance)
+    return ACCEPTED
 
 
 _M = mavlink
@@ -440,5 +455,5 @@ TABLE: dict[int, Row] = {
     _M.MAV_CMD_PREFLIGHT_CALIBRATION: Row(_calibrate, "refused: simulated sensors need none"),
     _M.MAV_CMD_PREFLIGHT_STORAGE: Row(_storage, "2 and 4 reset the parameters; disarmed only"),
     _M.MAV_CMD_RUN_PREARM_CHECKS: Row(_prearm_checks, "says what keeps it from arming"),
-    _M.MAV_CMD_INJECT_FAILURE: Row(_inject_failure, "refused: no failure is injected by command"),
+    _M.MAV_CMD_INJECT_FAILURE: Row(_inject_failure, "SYS_FAILURE_EN 1 needed; by the table of failures"),
 }

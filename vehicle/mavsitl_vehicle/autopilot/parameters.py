@@ -14,6 +14,7 @@ from zlib import crc32
 from mavsitl.dialect import mavlink
 from mavsitl.scenario import ScenarioError
 from mavsitl.services.parameter import Refused
+from mavsitl_vehicle import failures
 
 INT32_MIN, INT32_MAX = -(2**31), 2**31 - 1
 
@@ -28,6 +29,9 @@ UsedBy: TypeAlias = Literal["vehicle", "client"]
 
 Listener: TypeAlias = Callable[[str, float], None]
 """(name, new value)"""
+
+Guard: TypeAlias = Callable[[str, float], str | None]
+"""(name, value that the table allows): why a client cannot set it now, or None."""
 
 
 class Parameter(NamedTuple):
@@ -145,6 +149,19 @@ def _switch(
     return _choice(name, default, {0: "Off", 1: "On"}, text, long, live=live, used_by=used_by, note=note)
 
 
+def _event(row: Parameter) -> Parameter:
+    """What happens to the vehicle, not how it is set up: 0 at every start."""
+    return row._replace(volatile=True)
+
+
+def _failure(name: str) -> Parameter:
+    unit, instance = failures.PARAMETERS[name]
+    several = f" {instance}" if failures.INSTANCES.get(unit, 1) > 1 else ""
+    known = {kind.value: failures.named(kind).capitalize() for kind in failures.kinds(unit)}
+    text = f"Failure of the {failures.named(unit)}{several}, FAILURE_TYPE"
+    return _event(_choice(name, 0, known | {0: "OK"}, text, "Shows it whoever asked for it."))
+
+
 def _mask(
     name: str, default: int, bits: Mapping[int, str], text: str, long: str = "", *, used_by: UsedBy = "vehicle",
     note: str = "",
@@ -201,7 +218,7 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
                 "Put the parameters back to their defaults at the next start", live="boot", used_by="client"),
         _int("SYS_PARAM_VER", 1, 0, INT32_MAX, "", "Version of the airframe's parameter set", used_by="client"),
         _switch("SYS_FAILURE_EN", 0, "Let MAV_CMD_INJECT_FAILURE break things",
-                "No failure can be injected by command yet.", note="PX4's SITL start-up script sets 1"),
+                "By the scenario and by SIM_FAIL_* they break without it.", note="PX4's SITL start-up script sets 1"),
         _int("SYS_HAS_MAG", 1, 0, 4, "", "Number of magnetometers", live="boot", used_by="client"),
         _switch("SYS_HAS_GPS", 1, "There is a GPS receiver", live="boot", used_by="client"),
         _switch("SYS_HAS_BARO", 1, "There is a barometer", live="boot", used_by="client"),
@@ -503,6 +520,20 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
         _real("SIM_BAT_MIN_PCT", 50, 0, 100, "%", "The battery stops draining here", decimals=1),
         *_link("SIM_LINK", "the off-board link"),
         *_link("SIM_GLINK", "the ground stations' links"),
+        *(_failure(name) for name in failures.PARAMETERS),
+        *(_event(_real(name, 1, 0, 1, "norm", f"Share of its thrust that motor {motor} has",
+                       "Below 1 it is the failure `wrong`, at 0 `off`."))
+          for name, motor in failures.EFFICIENCIES.items()),
+        _event(_real("SIM_CPU_STALL", 0, 0, 60, "s", "The autopilot does not run for so long",
+                     "The rotors keep what they were commanded last; nothing is sent, and what comes is lost. It "
+                     "returns to 0 by itself.", decimals=3)),
+        _event(_real("SIM_CLK_JUMP", 0, -1e8, 1e8, "s", "The clock of SYSTEM_TIME goes wrong by so much",
+                     "The time since boot, TIMESYNC and control go on as they are.", decimals=3)),
+        _real("SIM_GUST_SPD", 3, 0, 40, "m/s", "Peak of the gust that SIM_GUST_TRIG starts", decimals=1),
+        _real("SIM_GUST_DIR", 0, -360, 360, "deg", "Where that gust comes from, clockwise from north", decimals=0),
+        _real("SIM_GUST_LEN", 2, 0.01, 60, "s", "From calm to that gust's peak; it falls as slowly", decimals=2),
+        _event(_switch("SIM_GUST_TRIG", 0, "A 1-cosine gust blows, on top of all other wind",
+                       "1 starts it, in flight only; it returns to 0 when the gust is over, and 0 ends it.")),
     ),
 )
 # fmt: on
@@ -531,6 +562,7 @@ class Parameters:
         self._indices = {name: index for index, name in enumerate(self.names)}
         self._defaults = {name: TABLE[name].default for name in self.names}
         self._listeners: list[Listener] = []
+        self._guards: list[Guard] = []
         self._hash: int | None = None
         self._locked: dict[str, str] = {}
         for layer in layers:
@@ -576,6 +608,9 @@ class Parameters:
         problem = row.problem(value)
         if problem is not None:
             return Refused(mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE, f"{name}: {problem}")
+        for guard in self._guards:
+            if problem := guard(name, value):
+                return Refused(mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE, f"{name}: {problem}")
         self._store(row, value)
         return None
 
@@ -616,6 +651,10 @@ class Parameters:
         """
         self._listeners.append(listener)
         return lambda: self._listeners.remove(listener)
+
+    def guard(self, guard: Guard) -> None:
+        """Ask `guard` before a client's value is taken."""
+        self._guards.append(guard)
 
     def hash(self) -> int:
         """PX4's `_HASH_CHECK`: names and four-byte values in sorted order, volatile ones left out.

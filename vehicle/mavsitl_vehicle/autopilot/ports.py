@@ -39,6 +39,10 @@ SANDBOX, LOGS = "/fs/microsd", "/fs/microsd/log"
 """PX4's places of the memory card and of the logs on it."""
 
 
+OFFBOARD_LINK, GCS_LINK = 1, 2
+"""Instances of the failure unit MAVLINK."""
+
+
 class Shared:
     """What the links of one vehicle share: parameters, plans, files, key."""
 
@@ -96,6 +100,12 @@ class Port:
         self.node = Node(autopilot.system_id, COMPONENT_ID, signing)
         profile: telemetry.Profile = "gcs" if name == "gcs" else "offboard"
         self.schedule = telemetry.Schedule("lockstep" if lockstep else profile)
+        self.instance = OFFBOARD_LINK if profile == "offboard" else GCS_LINK
+        """Of the failure unit MAVLINK."""
+        self.down = False
+        """Nothing comes in and nothing goes out."""
+        self.subject: telemetry.Subject = autopilot
+        """What telemetry speaks of."""
         self._autopilot = autopilot
         self._commands = CommandServer(self._execute)
         self._busy_until_us = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from heapq import heapify, heapreplace
 from math import atan2, hypot, nan, pi, sqrt
 from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
@@ -190,6 +191,10 @@ class Subject(Protocol):
         """(4,) of the rotors, 0 to 1."""
 
     @property
+    def silent_escs(self) -> int:
+        """Speed controllers without telemetry, bit i - 1 for rotor i."""
+
+    @property
     def origin(self) -> Origin: ...
 
     @property
@@ -219,6 +224,27 @@ class Subject(Protocol):
 
     @property
     def metadata(self) -> Metadata | None: ...
+
+
+class Frozen:
+    """A `Subject` whose state stays as it is, however the vehicle goes on: telemetry that hangs.
+
+    Mode, arming, landed state, home, mission and times stay true: they are the commander's, not the estimator's.
+    """
+
+    _KEPT = (
+        "estimate", "accuracy", "truth", "true_wind", "outputs", "specific_force_flu_m_s2", "health", "attitude_target",
+        "position_target", "wind", "sticks",
+    )  # fmt: skip
+
+    def __init__(self, subject: Subject) -> None:
+        self._subject = subject
+        self.battery = copy(subject.battery)
+        for name in self._KEPT:
+            setattr(self, name, getattr(subject, name))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._subject, name)
 
 
 Sampler: TypeAlias = Callable[[Any, Node, int], bool]
@@ -781,8 +807,8 @@ _NO_TEMPERATURES = (INT16_MAX,) * 4
 
 
 def send_esc_info(subject: Subject, node: Node, now_us: int) -> bool:
-    """Four speed controllers that report ten times a second and never fail; no temperature sensor."""
-    online = _FOUR_ACTIVE if subject.health.motors else 0
+    """Four speed controllers that report ten times a second unless they fail; no temperature sensor."""
+    online = _FOUR_ACTIVE & ~subject.silent_escs
     node.send(
         _ESC_INFO, 0, now_us, now_us // _ESC_PERIOD_US & UINT16_MAX, 4, 0, online,
         (0, 0, 0, 0), (0, 0, 0, 0), _NO_TEMPERATURES,

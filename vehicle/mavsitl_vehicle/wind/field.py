@@ -121,8 +121,7 @@ class WindField:
                     rows.append([STEADY, *wind.velocity_nwu_m_s])
                     continue
                 case Gust():
-                    model = GUST_PULSE if wind.shape == "pulse" else GUST_RAMP
-                    rows.append([model, *wind.velocity_nwu_m_s, wind.start_s, wind.length_s])
+                    rows.append(_gust_row(wind))
                     continue
                 case DrydenPaper():
                     axes = np.eye(3)
@@ -148,6 +147,16 @@ class WindField:
         self.normals_for_reset = self.normals_per_step
         """Standard normals for each vehicle that `reset` takes."""
         self.state: Array = np.zeros((self.normals_per_step, n))
+
+    def add(self, gust: Gust) -> None:
+        """One more, which needs no normals: what is drawn for the others stays as it is."""
+        row = np.zeros((1, N_COLUMNS))
+        row[0, : GUST_LENGTH + 1] = _gust_row(gust)
+        self.coefficients = np.vstack((self.coefficients, row))
+
+    def drop_last(self) -> None:
+        """Without the gust that was added last."""
+        self.coefficients = self.coefficients[:-1].copy()
 
     def reset(self, normals: Array) -> None:
         """Draw the turbulence's state from its stationary distribution: `normals` (normals_for_reset, n), in place.
@@ -175,6 +184,11 @@ class WindField:
     def _check(self, array: Array, rows: int) -> None:
         if array.shape != (rows, self.n):
             raise ValueError(f"an array of shape {array.shape}; ({rows}, {self.n}) is needed")
+
+
+def _gust_row(gust: Gust) -> list[float]:
+    model = GUST_PULSE if gust.shape == "pulse" else GUST_RAMP
+    return [model, *gust.velocity_nwu_m_s, gust.start_s, gust.length_s]
 
 
 def mil_axes(from_deg: float) -> Array:
