@@ -25,7 +25,9 @@ from mavsitl_vehicle.autopilot.seated import SeatedLaw
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint
 from mavsitl_vehicle.autopilot.storage import Store, keep_parameters
 from mavsitl_vehicle.autopilot.wind_estimate import WindEstimate
+from mavsitl_vehicle.failures import Failures
 from mavsitl_vehicle.record import Record
+from mavsitl_vehicle.sensors.status import Readings
 from mavsitl_vehicle.simulation import Simulation
 
 PLAN_SCHEMA = 1
@@ -85,7 +87,8 @@ class Vehicle:
         self._signing_us = 0
         card = None if state is None else state / "card"
         self._shared = Shared(self.parameters, self.plan, card=card, logs=logs, signing=self._signing, trusted=trusted)
-        self.simulation = Simulation(flight, self.parameters, seed)
+        self.failures = Failures()
+        self.simulation = Simulation(flight, self.parameters, seed, failures=self.failures)
         self.autopilot = self._boot(0)
         self.parameters.subscribe(self._on_parameter)
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
@@ -132,6 +135,7 @@ class Vehicle:
             lockstep=self._lockstep, unix_boot_us=unix_us,
         )  # fmt: skip
         autopilot.estimate = self.simulation.estimate[:, 0].tolist()
+        autopilot.estimator_status = self.simulation.estimator_status
         if not self._lockstep:
             autopilot.set_home_here()  # MAVSDK asks for it as soon as it hears the vehicle
         else:
@@ -198,12 +202,14 @@ class Vehicle:
         now_us -= self._boot_us
         if not first and now_us:
             simulation.held[0] = autopilot.land.held
+            simulation.at_rest[0] = autopilot.at_rest
             setpoint = autopilot.decide(now_us - self.period_us)
             simulation.set_demand(0, self._inner_law(setpoint))
             released_us = autopilot.land.released_us
             flown_s = -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
             simulation.advance(flown_s)
         autopilot.estimate = simulation.estimate[:, 0].tolist()
+        autopilot.estimator_status = simulation.estimator_status
         if self._wind is not None:
             self._wind.update(simulation.estimate, simulation.demand[tick.THRUST, 0], not autopilot.on_ground)
             autopilot.wind = self._wind.value
@@ -246,6 +252,7 @@ class Vehicle:
         old = self.autopilot
         if not old.health.upright and old.on_ground:
             self.simulation.set_upright()
+        self.simulation.restart_estimator()
         self._boot_us = now_us
         self.plan.stores.transaction = None  # it counts in the old time
         self.autopilot = self._boot(now_us)
@@ -294,6 +301,10 @@ class _Body:
     def true_wind(self) -> Vector:
         x, y, z = self._simulation.wind[:, 0].tolist()
         return x, y, z
+
+    @property
+    def readings(self) -> Readings | None:
+        return self._simulation.readings
 
     @property
     def rotor_speeds_rad_s(self) -> Sequence[float]:
