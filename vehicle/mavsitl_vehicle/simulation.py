@@ -242,9 +242,7 @@ class Simulation:
         self._wind_block = np.stack(
             [g.standard_normal((BLOCK_TICKS, wind_rows)) for g in self._wind_generators], axis=-1
         )
-        self._sensor_block = np.stack(
-            [g.standard_normal((BLOCK_TICKS, sensor_rows)) for g in generators], axis=-1
-        )
+        self._sensor_block = np.stack([g.standard_normal((BLOCK_TICKS, sensor_rows)) for g in generators], axis=-1)
 
     def _warm_up(self) -> None:
         """Run each kernel once on copies, so that compiling, or reading the cache, is done before the clock runs."""

@@ -537,7 +537,7 @@ def send_gps_raw_int(subject: Subject, node: Node, now_us: int) -> bool:
         e, quality = subject.estimate, subject.accuracy
         fix = GpsReading(
             (e[0], e[1], e[2]), (e[3], e[4], e[5]), _SATELLITES,
-            quality.position_m, quality.position_m, quality.velocity_m_s, now_us,
+            quality.position_m, quality.position_m, quality.velocity_m_s, 0,
         )  # fmt: skip
     else:
         fix = None
@@ -552,7 +552,7 @@ def send_gps_raw_int(subject: Subject, node: Node, now_us: int) -> bool:
     lat, lon = origin.to_global(x, y)
     altitude_mm = millimetres(origin.altitude_amsl_m + z)
     node.send(
-        _GPS_RAW_INT, max(fix.measured_us, 0), mavlink.GPS_FIX_TYPE_3D_FIX, deg_e7(lat), deg_e7(lon), altitude_mm,
+        _GPS_RAW_INT, max(now_us - fix.age_us, 0), mavlink.GPS_FIX_TYPE_3D_FIX, deg_e7(lat), deg_e7(lon), altitude_mm,
         _HDOP_CENTI, _VDOP_CENTI, centimetres_per_s_unsigned(hypot(vx, vy)), heading_cdeg(atan2(-vy, vx)),
         fix.satellites, altitude_mm, millimetres_unsigned(fix.eph_m), millimetres_unsigned(fix.epv_m),
         millimetres_unsigned(fix.evs_m_s), 0, _NO_YAW,

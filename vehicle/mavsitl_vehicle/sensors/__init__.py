@@ -1,1 +1,1 @@
-"""Simulated sensors, and the filter that makes the vehicle's state of them: what `estimator.kind = "ekf"` flies with."""
+"""Simulated sensors, and the filter over them: what the vehicle flies by with `estimator.kind = "ekf"`."""

@@ -187,9 +187,11 @@ def advance(
     x: Array, p: Array, ring: Array, head: int, delta: Array, aligned: bool, dt_s: float, gravity_m_s2: float,
     process: Array, due: Array,
 ) -> None:  # fmt: skip
-    """Put the newest IMU interval, `delta` (6, n), into `ring` (d, 6, n) at `head`, and predict over the one it
-    replaces: the filter lives d intervals in the past, when the latest measurement comes in. `due` (6, n) is scratch.
-    """  # noqa: D205
+    """One control period: the newest IMU interval, `delta` (6, n), takes the oldest one's place in `ring` (d, 6, n).
+
+    That is the one at `head`, and the filter predicts over it: it lives d intervals in the past, when the latest
+    measurement comes in. `due` (6, n) is scratch.
+    """
     depth = ring.shape[0]
     for j in range(x.shape[1]):
         for i in range(6):
@@ -293,13 +295,12 @@ def magnetometer_row(x: Array, field: Array, axis: int, h: Array, j: int) -> flo
     h[E_ATTITUDE + 1] = column[2] * field[0] - column[0] * field[2]
     h[E_ATTITUDE + 2] = column[0] * field[1] - column[1] * field[0]
     h[E_MAG_OFFSET + axis] = 1.0
-    return column[0] * field[0] + column[1] * field[1] + column[2] * field[2] + x[MAG_OFFSET + axis, j]
+    expected: float = column[0] * field[0] + column[1] * field[1] + column[2] * field[2] + x[MAG_OFFSET + axis, j]
+    return expected
 
 
 @compiled
-def fuse_magnetometer(
-    x: Array, p: Array, z: Array, field: Array, variance: float, gate: float, test: Array
-) -> None:
+def fuse_magnetometer(x: Array, p: Array, z: Array, field: Array, variance: float, gate: float, test: Array) -> None:
     """`z` (3, n) gauss FLU, all three or none; `test` (n,) gets the largest ratio. `gate` 0: fused whatever comes."""
     h = np.zeros(ERROR_ROWS)
     for j in range(x.shape[1]):
@@ -347,9 +348,7 @@ def fuse_direct(
 
 
 @compiled
-def fuse_at_rest(
-    x: Array, p: Array, force: Array, force_variance: float, gravity_m_s2: float
-) -> None:
+def fuse_at_rest(x: Array, p: Array, force: Array, force_variance: float, gravity_m_s2: float) -> None:
     """The accelerometer's mean at rest, `force` (3, n): it is gravity's reaction, R^T (0, 0, g), and the bias."""
     h = np.zeros(ERROR_ROWS)
     world = np.array([0.0, 0.0, gravity_m_s2])

@@ -85,8 +85,8 @@ class SensedEstimator:
 
         self.x = np.zeros((ekf.STATE_ROWS, n))
         self.p = np.zeros((ekf.ERROR_ROWS, ekf.ERROR_ROWS, n))
-        slow: tuple[SlowSensor, ...] = (self.gps, self.barometer, self.magnetometer)
-        self.depth = -(-max(sensor.delay_us for sensor in slow) // self.period_us)
+        self._slow: tuple[SlowSensor, ...] = (self.gps, self.barometer, self.magnetometer)
+        self.depth = -(-max(sensor.delay_us for sensor in self._slow) // self.period_us)
         """Intervals between the filter's time and now."""
         self._ring = np.zeros((self.depth, 6, n))
         self._head = 0
@@ -175,7 +175,7 @@ class SensedEstimator:
         )  # fmt: skip
         if self.depth:
             self._head = (self._head + 1) % self.depth
-        for sensor in (self.gps, self.barometer, self.magnetometer):
+        for sensor in self._slow:
             came = sensor.step(x, now_us)
             if came is not None:
                 self._waiting.append((sensor, came))
@@ -212,7 +212,7 @@ class SensedEstimator:
         self.aligned = False
         self._align_us = 0
         self._sums[:] = 0.0
-        self._seen = {sensor: [] for sensor in (self.gps, self.barometer, self.magnetometer)}
+        self._seen = {sensor: [] for sensor in self._slow}
 
     def _coarse(self, force: Array, field: Array) -> None:
         """Attitude from one look at gravity and field, (3, n) each: TRIAD. Where it stands until the filter begins."""
@@ -412,9 +412,7 @@ class SensedEstimator:
             now_us - self._accel_us <= IMU_TIMEOUT_US,
             self.magnetometer.fresh(now_us, SENSOR_TIMEOUT_US),
             self.barometer.fresh(now_us, SENSOR_TIMEOUT_US),
-            newest is not None
-            and newest.satellites >= USED_SATELLITES
-            and self.gps.fresh(now_us, SENSOR_TIMEOUT_US),
+            newest is not None and newest.satellites >= USED_SATELLITES and self.gps.fresh(now_us, SENSOR_TIMEOUT_US),
         )
 
     def readings(self) -> Readings:
@@ -439,7 +437,7 @@ class SensedEstimator:
             (x, y, z), (vx, vy, vz), fix.satellites,
             sqrt((gps.horizontal_noise_m * fix.noise) ** 2 + gps.horizontal_drift_m**2),
             sqrt((gps.vertical_noise_m * fix.noise) ** 2 + gps.vertical_drift_m**2),
-            gps.velocity_noise_m_s * fix.noise, fix.stamp_us,
+            gps.velocity_noise_m_s * fix.noise, self.now_us - fix.stamp_us,
         )  # fmt: skip
 
 
@@ -456,6 +454,5 @@ def _quaternion(rows: Array) -> Array:
         ]
     )
     q = np.triu(q) + np.triu(q, 1).T
-    values, vectors = np.linalg.eigh(q)
-    best: Array = vectors[:, -1]
+    best: Array = np.linalg.eigh(q)[1][:, -1]
     return best if best[0] >= 0.0 else -best

@@ -59,10 +59,11 @@ class Fault:
                 self._stuck = values
             return self._stuck
         if kind is Kind.GARBAGE:
-            draws: Array = self._generator.standard_normal(values.shape)
-            return values + self._garbage * draws
+            garbage: Array = values + self._garbage * self._generator.standard_normal(values.shape)
+            return garbage
         if kind is Kind.WRONG:
-            return values + self._wrong
+            offset: Array = values + self._wrong
+            return offset
         there = (
             kind is Kind.DELAYED
             or (kind is Kind.SLOW and self._count % SLOWER == 0)

@@ -162,7 +162,9 @@ class Imu:
         added: (6,), offset put on the samples: rad/s and m/s^2, FLU.
     """
 
-    def __init__(self, settings: Settings, gravity_m_s2: float, dt_s: float, period_s: float, seed: int, n: int) -> None:
+    def __init__(
+        self, settings: Settings, gravity_m_s2: float, dt_s: float, period_s: float, seed: int, n: int
+    ) -> None:
         self._settings = settings
         self._dt_s = dt_s
         self.generators = [seeds.generator(seed, "vehicle", j, "imu") for j in range(n)]

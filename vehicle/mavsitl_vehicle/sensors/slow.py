@@ -98,9 +98,7 @@ class Gps(SlowSensor):
     GARBAGE = (50.0, 50.0, 50.0, 5.0, 5.0, 5.0)
 
     def __init__(self, settings: GpsSettings, parameters: Values, failures: Failures, seed: int, n: int) -> None:
-        super().__init__(
-            Fault(Unit.GPS, self.WRONG, self.GARBAGE, seed), settings.rate_hz, settings.delay_ms, failures
-        )
+        super().__init__(Fault(Unit.GPS, self.WRONG, self.GARBAGE, seed), settings.rate_hz, settings.delay_ms, failures)
         self._parameters = parameters
         self._generators = [seeds.generator(seed, "vehicle", j, "gps") for j in range(n)]
         h, v, s = settings.horizontal_noise_m, settings.vertical_noise_m, settings.velocity_noise_m_s

@@ -67,7 +67,7 @@ class GpsReading(NamedTuple):
     eph_m: float
     epv_m: float
     evs_m_s: float
-    measured_us: int
+    age_us: int
 
 
 class Readings(NamedTuple):
