@@ -626,18 +626,23 @@ _POSITION_FLAGS: int = (
 )
 
 
-def send_estimator_status(subject: Subject, node: Node, now_us: int) -> bool:
-    """Ratios of 0 where no filter runs; those of sensors that are not there are unknown."""
-    health, status = subject.health, subject.estimator_status
-    flags = (
+def estimator_flags(health: Health, status: EstimatorStatus) -> int:
+    """ESTIMATOR_STATUS_FLAGS"""
+    flags: int = (
         (_ATTITUDE_FLAGS if health.attitude else 0)
         | (_HEIGHT_FLAGS if health.height else 0)
         | (_POSITION_FLAGS if health.position else mavlink.ESTIMATOR_CONST_POS_MODE)
         | (mavlink.ESTIMATOR_GPS_GLITCH if status.position_ratio > 1.0 else 0)
     )
+    return flags
+
+
+def send_estimator_status(subject: Subject, node: Node, now_us: int) -> bool:
+    """Ratios of 0 where no filter runs; those of sensors that are not there are unknown."""
+    status = subject.estimator_status
     node.send(
-        _ESTIMATOR_STATUS, now_us, flags, status.velocity_ratio, status.position_ratio, status.height_ratio,
-        status.mag_ratio, nan, nan, status.eph_m, status.epv_m,
+        _ESTIMATOR_STATUS, now_us, estimator_flags(subject.health, status), status.velocity_ratio,
+        status.position_ratio, status.height_ratio, status.mag_ratio, nan, nan, status.eph_m, status.epv_m,
     )  # fmt: skip
     return True
 

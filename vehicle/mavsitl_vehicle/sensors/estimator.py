@@ -19,7 +19,7 @@ from mavsitl_vehicle.sensors.imu import Imu
 from mavsitl_vehicle.sensors.slow import FIX_SATELLITES, Barometer, Gps, Magnetometer, Measurement, SlowSensor
 from mavsitl_vehicle.sensors.status import EstimatorStatus, GpsReading, Readings, SensorHealth
 
-ALIGN_US = 500_000
+ALIGN_US = 400_000
 """At rest for so long, the filter begins."""
 REST_RAD_S = radians(5.0)
 """The gyro's mean moves by less than this between the halves of the alignment, or the vehicle is not at rest."""
@@ -93,6 +93,8 @@ class SensedEstimator:
         self._now = np.zeros((ekf.STATE_ROWS, n))
         self._due = np.zeros((6, n))
         self._waiting: deque[tuple[SlowSensor, Measurement]] = deque()
+        self.came: list[tuple[SlowSensor, Measurement]] = []
+        """What came in this period."""
         self.aligned = False
         self._located = False
         """The filter has begun before, so that the offsets of GPS and barometer are known."""
@@ -175,9 +177,11 @@ class SensedEstimator:
         )  # fmt: skip
         if self.depth:
             self._head = (self._head + 1) % self.depth
+        self.came.clear()
         for sensor in self._slow:
             came = sensor.step(x, now_us)
             if came is not None:
+                self.came.append((sensor, came))
                 self._waiting.append((sensor, came))
         if self.aligned:
             horizon_us = now_us - self.depth * self.period_us
@@ -425,10 +429,11 @@ class SensedEstimator:
             tuple(accel),
             None if field is None else tuple(field.values[:, 0].tolist()),
             None if height is None else float(height.values[0, 0]),
-            None if fix is None or not self.gps.fresh(self.now_us, SENSOR_TIMEOUT_US) else self._gps_reading(fix),
+            None if fix is None or not self.gps.fresh(self.now_us, SENSOR_TIMEOUT_US) else self.gps_reading(fix),
         )
 
-    def _gps_reading(self, fix: Measurement) -> GpsReading | None:
+    def gps_reading(self, fix: Measurement) -> GpsReading | None:
+        """Of vehicle 0; None: no fix."""
         if fix.satellites < FIX_SATELLITES:
             return None
         gps = self._settings.gps
