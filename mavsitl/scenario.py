@@ -110,12 +110,81 @@ Wind: TypeAlias = Steady | Gust | DrydenPaper | DrydenMil
 
 
 class Noise(Section, frozen=True):
-    """1-sigma of the Gaussian white noise on every feedback variable (section 5 of the paper; levels: see the docs)."""
+    """1-sigma of the Gaussian white noise on every feedback variable (section 5 of the paper; levels: see the docs).
+
+    Only with estimator.kind = "white-noise".
+    """
 
     position_m: NonNegative = 0.005
     velocity_m_s: NonNegative = 0.005
     attitude_deg: NonNegative = 0.02
     rate_deg_s: NonNegative = 0.1
+
+
+SensorRate = Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)]
+SensorDelay = Annotated[float, msgspec.Meta(ge=0.0, le=500.0)]
+
+
+class Imu(Section, frozen=True):
+    """Gyroscope and accelerometer, sampled at every physics step; the defaults are of ICM-20689's class, calibrated."""
+
+    gyro_noise_deg_s_rt_hz: NonNegative = 0.006
+    gyro_bias_deg_s: NonNegative = 0.5
+    """1 sigma of the offset at switching on, each axis for itself."""
+    gyro_bias_walk_deg_s_rt_s: NonNegative = 0.003
+    """The offset's random walk: 1 sigma of its change in a second."""
+    accel_noise_m_s2_rt_hz: NonNegative = 0.0015
+    accel_bias_m_s2: NonNegative = 0.03
+    """1 sigma of what is left of the offset after calibration."""
+    accel_bias_walk_m_s2_rt_s: NonNegative = 0.0003
+
+
+class Gps(Section, frozen=True):
+    """Position and velocity; the defaults are of a u-blox M8 or M9. Noise is 1 sigma of each fix, drift correlated."""
+
+    rate_hz: SensorRate = 10.0
+    delay_ms: SensorDelay = 100.0
+    """From the measurement to its arrival; the filter knows it."""
+    horizontal_noise_m: NonNegative = 0.1
+    vertical_noise_m: NonNegative = 0.2
+    horizontal_drift_m: NonNegative = 1.0
+    """1 sigma of the slow error of each axis, a first-order Gauss-Markov process."""
+    vertical_drift_m: NonNegative = 1.5
+    drift_time_s: Positive = 100.0
+    """Correlation time of the slow error."""
+    velocity_noise_m_s: NonNegative = 0.05
+
+
+class Barometer(Section, frozen=True):
+    """Height by pressure; the defaults are of MS5611's class."""
+
+    rate_hz: SensorRate = 50.0
+    delay_ms: SensorDelay = 0.0
+    noise_m: NonNegative = 0.15
+    offset_m: NonNegative = 5.0
+    """1 sigma of the weather's offset from the standard atmosphere at the start."""
+    drift_m_rt_s: NonNegative = 0.01
+    """The offset's random walk: 1 sigma of its change in a second."""
+
+
+class Magnetometer(Section, frozen=True):
+    """The Earth's field in body axes."""
+
+    rate_hz: SensorRate = 50.0
+    delay_ms: SensorDelay = 0.0
+    noise_gauss: NonNegative = 0.003
+    offset_gauss: NonNegative = 0.003
+    """1 sigma of what is left of the vehicle's own field after calibration, each axis for itself."""
+
+
+class Estimator(Section, frozen=True):
+    """Where the vehicle's state is from: the truth with white noise (table noise), or an EKF over these sensors."""
+
+    kind: Literal["white-noise", "ekf"] = "white-noise"
+    imu: Imu = Imu()
+    gps: Gps = Gps()
+    barometer: Barometer = Barometer()
+    magnetometer: Magnetometer = Magnetometer()
 
 
 Milliseconds = Annotated[float, msgspec.Meta(ge=0.0, le=10_000.0)]
@@ -371,6 +440,7 @@ class Scenario(Section, frozen=True):
     wind: tuple[Wind, ...] = ()
     """Summed."""
     noise: Noise = Noise()
+    estimator: Estimator = Estimator()
     link: LinkModel = LinkModel()
     """The off-board link."""
     gcs_link: LinkModel = LinkModel()
@@ -629,6 +699,7 @@ def _check(scenario: Scenario, where: str) -> None:
         raise ScenarioError(
             f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'"
         )
+    _check_estimator(scenario, where)
     _check_link(scenario.link, f"{where}: link")
     _check_link(scenario.gcs_link, f"{where}: gcs_link")
     if scenario.chaos:
@@ -662,6 +733,28 @@ def _check_chaos(windows: tuple[ChaosWindow, ...], where: str) -> None:
             parse(window.mode)
         except ChaosError as error:
             raise ScenarioError(f"{where}: chaos[{index}].mode: {error}") from None
+
+
+def _check_estimator(scenario: Scenario, where: str) -> None:
+    """Settings that the chosen kind does not read are refused."""
+    estimator, control_hz = scenario.estimator, scenario.rates.control_hz
+    if estimator.kind == "ekf":
+        if scenario.noise != Noise():
+            raise ScenarioError(
+                f"{where}: noise: is of estimator.kind 'white-noise', not 'ekf'; allowed: absent; "
+                "each sensor has its own noise in estimator.imu, gps, barometer, magnetometer"
+            )
+        for name in ("gps", "barometer", "magnetometer"):
+            rate_hz = getattr(estimator, name).rate_hz
+            if rate_hz > control_hz:
+                raise ScenarioError(
+                    f"{where}: estimator.{name}.rate_hz: {rate_hz:g} is not allowed; "
+                    f"allowed: at most rates.control_hz ({control_hz})"
+                )
+    elif estimator != Estimator():
+        raise ScenarioError(
+            f"{where}: estimator: settings of sensors need estimator.kind 'ekf'; 'white-noise' has none"
+        )
 
 
 def _check_impairment(impairment: Impairment, where: str) -> None:

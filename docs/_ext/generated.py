@@ -69,6 +69,13 @@ UNITS = {
     "ah": "A h",
     "ohm": "Ω",
     "w": "W",
+    "ms": "ms",
+    "gauss": "G",
+    "deg_s_rt_hz": "°/s/√Hz",
+    "deg_s_rt_s": "°/s/√s",
+    "m_s2_rt_hz": "m/s²/√Hz",
+    "m_s2_rt_s": "m/s²/√s",
+    "m_rt_s": "m/√s",
 }
 """What ends a key, and the unit it stands for."""
 

@@ -159,6 +159,52 @@ CHANNELS = {
 """An impaired link's directions, once a second: counts of messages since the start, as in
 `mavsitl.link.impaired.Statistics`, and the delays of those that came in that second."""
 
+# Sensors and filter, where the vehicle has them: PX4's names, a row as each measures
+SENSOR_COMBINED = Topic(
+    "sensor_combined",
+    (
+        "float[3] gyro_rad",
+        "uint32_t gyro_integral_dt",
+        "float[3] accelerometer_m_s2",
+        "uint32_t accelerometer_integral_dt",
+    ),
+)
+"""Means over a control period."""
+GPS_POSITION = Topic(
+    "vehicle_gps_position",
+    (
+        "uint64_t timestamp_sample",
+        "double latitude_deg",
+        "double longitude_deg",
+        "double altitude_msl_m",
+        "float eph",
+        "float epv",
+        "float s_variance_m_s",
+        "float vel_n_m_s",
+        "float vel_e_m_s",
+        "float vel_d_m_s",
+        "uint8_t fix_type",
+        "uint8_t satellites_used",
+    ),
+)
+AIR_DATA = Topic("vehicle_air_data", ("uint64_t timestamp_sample", "float baro_alt_meter", "float baro_pressure_pa"))
+MAGNETOMETER = Topic("vehicle_magnetometer", ("uint64_t timestamp_sample", "float[3] magnetometer_ga"))
+ESTIMATOR_STATUS = Topic(
+    "estimator_status",
+    (
+        "float pos_horiz_accuracy",
+        "float pos_vert_accuracy",
+        "float vel_test_ratio",
+        "float pos_test_ratio",
+        "float hgt_test_ratio",
+        "float mag_test_ratio",
+        "uint16_t solution_status_flags",
+    ),
+)
+"""solution_status_flags: MAVLink's ESTIMATOR_STATUS_FLAGS."""
+SENSOR_BIAS = Topic("estimator_sensor_bias", ("float[3] gyro_bias", "float[3] accel_bias"))
+"""What the filter takes for the IMU's bias."""
+
 # Whichever end the nets are seated in
 PIDNN_WEIGHTS = Topic("pidnn_weights", ("float[3] roll", "float[3] pitch", "float[3] yaw"))
 """Output weights P, I, D."""
@@ -191,6 +237,12 @@ VEHICLE_TOPICS = (
     *TELEMETRY_STATUS,
     *(topic for directions in CHANNELS.values() for topic in directions.values()),
     INJECTED_FAILURE,
+    SENSOR_COMBINED,
+    GPS_POSITION,
+    AIR_DATA,
+    MAGNETOMETER,
+    ESTIMATOR_STATUS,
+    SENSOR_BIAS,
 )
 GROUND_TOPICS = (TRAJECTORY_SETPOINT, ATTITUDE_SETPOINT, CONTROL_DEMAND, PIDNN_WEIGHTS, LINK_STATUS)
 TOPICS = tuple(dict.fromkeys(VEHICLE_TOPICS + GROUND_TOPICS))

@@ -35,6 +35,7 @@ from mavsitl_vehicle.autopilot.telemetry import (
     atmosphere,
     request,
 )
+from mavsitl_vehicle.sensors.status import EstimatorStatus, Readings, known
 
 from mavsitl import __version__
 from mavsitl.codec import parse
@@ -77,7 +78,9 @@ class Told:
     health: Health = field(default_factory=Health)
     battery: Battery = field(default_factory=lambda: Battery(load_airframe("paper")))
     estimate: Sequence[float] = STATE
-    accuracy: Accuracy = field(default_factory=lambda: accuracy(Noise()))
+    estimator_status: EstimatorStatus = field(default_factory=lambda: known(Noise()))
+    accuracy: Accuracy = field(default_factory=lambda: accuracy(known(Noise())))
+    readings: Readings | None = None
     specific_force_flu_m_s2: Vector = (0.1, 0.2, 9.80665)
     truth: Sequence[float] = (*STATE, 100.0, 200.0, 300.0, 400.0)
     true_wind: Vector = (0.0, 0.0, 0.5)
@@ -445,6 +448,7 @@ def wild_subject(value: float) -> Told:
         load=value,
         battery=pack,
         estimate=state,
+        estimator_status=EstimatorStatus(True, True, True, True, False, *(value,) * 11),
         accuracy=Accuracy(value, value, [value] * 21, [value] * 21),
         specific_force_flu_m_s2=three,
         truth=(*state, *(min(max(value, -limit), limit),) * 4),

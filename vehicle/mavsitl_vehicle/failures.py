@@ -49,6 +49,46 @@ INSTANCES = {Unit.MOTOR: 4, Unit.MAVLINK: 2}
 """Of a unit; any other has one. The link's are 1 off-board, 2 ground stations."""
 
 TABLE: Mapping[tuple[Unit, Kind], str] = {
+    # --- sensors: with estimator.kind = "ekf" alone (`mavsitl_vehicle.sensors`)
+    (Unit.GYRO, Kind.OFF): "No samples: rate loop and filter keep the last one; the attitude is not valid after 0.1 s.",
+    (Unit.GYRO, Kind.STUCK): "Rate loop and filter see the value of that moment for ever; nothing notices.",
+    (Unit.GYRO, Kind.GARBAGE): "Noise of 10 rad/s (1 sigma).",
+    (Unit.GYRO, Kind.WRONG): "20 deg/s too much about each axis.",
+    (Unit.GYRO, Kind.SLOW): "50 samples a second.",
+    (Unit.GYRO, Kind.DELAYED): "20 ms late.",
+    (Unit.GYRO, Kind.INTERMITTENT): "Each 50 ms there or not, as a coin falls; the last sample is kept meanwhile.",
+    (Unit.ACCEL, Kind.OFF): "No samples: the filter keeps the last one; "
+    "velocity, position and height are not valid after 0.1 s.",
+    (Unit.ACCEL, Kind.STUCK): "The filter sees the value of that moment for ever.",
+    (Unit.ACCEL, Kind.GARBAGE): "Noise of 50 m/s^2 (1 sigma).",
+    (Unit.ACCEL, Kind.WRONG): "3 m/s^2 too much along each axis.",
+    (Unit.ACCEL, Kind.SLOW): "50 samples a second.",
+    (Unit.ACCEL, Kind.DELAYED): "20 ms late.",
+    (Unit.ACCEL, Kind.INTERMITTENT): "Each 50 ms there or not, as a coin falls; the last sample is kept meanwhile.",
+    (Unit.MAG, Kind.OFF): "No measurements: the heading is the gyro's, and what GPS shows of it in motion.",
+    (Unit.MAG, Kind.STUCK): "The field of that moment in body axes for ever: right until the vehicle turns.",
+    (Unit.MAG, Kind.GARBAGE): "Noise of 0.5 gauss (1 sigma); most of it is refused at the gate.",
+    (Unit.MAG, Kind.WRONG): "0.15 gauss too much forward and to the left, as a current beside it makes.",
+    (Unit.MAG, Kind.SLOW): "One measurement in ten.",
+    (Unit.MAG, Kind.DELAYED): "0.5 s late, and the filter is not told.",
+    (Unit.MAG, Kind.INTERMITTENT): "Each 0.5 s there or not, as a coin falls.",
+    (Unit.BARO, Kind.OFF): "No measurements: the height is GPS's.",
+    (Unit.BARO, Kind.STUCK): "The height of that moment for ever: refused when the vehicle climbs, "
+    "and believed with another offset after 5 s.",
+    (Unit.BARO, Kind.GARBAGE): "Noise of 50 m (1 sigma); most of it is refused at the gate.",
+    (Unit.BARO, Kind.WRONG): "15 m too high: refused, and believed with another offset after 5 s.",
+    (Unit.BARO, Kind.SLOW): "One measurement in ten.",
+    (Unit.BARO, Kind.DELAYED): "0.5 s late, and the filter is not told.",
+    (Unit.BARO, Kind.INTERMITTENT): "Each 0.5 s there or not, as a coin falls.",
+    (Unit.GPS, Kind.OFF): "No fixes: dead reckoning; velocity and position are not valid after EKF2_NOAID_TOUT.",
+    (Unit.GPS, Kind.STUCK): "The fix of that moment for ever, velocity too, with new stamps.",
+    (Unit.GPS, Kind.GARBAGE): "Noise of 50 m and 5 m/s (1 sigma) that the receiver does not tell of; "
+    "most of it is refused at the gates.",
+    (Unit.GPS, Kind.WRONG): "20 m north, 20 m west and 10 m up of the truth: refused, and believed after 7 s. "
+    "SIM_GPS_GLITCH_* have any other offset.",
+    (Unit.GPS, Kind.SLOW): "One fix in ten.",
+    (Unit.GPS, Kind.DELAYED): "0.5 s later than usual, and the filter is not told.",
+    (Unit.GPS, Kind.INTERMITTENT): "Each 0.5 s there or not, as a coin falls.",
     (Unit.BATTERY, Kind.OFF): "It reads empty, as PX4's simulated battery does; the rotors turn on.",
     (Unit.BATTERY, Kind.STUCK): "Charge, voltage and current stay as last measured, while the pack drains on.",
     (Unit.BATTERY, Kind.WRONG): "It collapses: charge and voltage fall at once. Well again, it has what it would have.",

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mavsitl.dialect import mavlink
 from mavsitl.frames import flip_quaternion
+from mavsitl.geodesy import Origin
 from mavsitl.log import topics
 from mavsitl.log.block import Array, Block, ned
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot import modes
+from mavsitl_vehicle.autopilot.health import Health
 from mavsitl_vehicle.autopilot.modes import Mode
+from mavsitl_vehicle.autopilot.telemetry import atmosphere, estimator_flags
 from mavsitl_vehicle.failures import Change
+from mavsitl_vehicle.sensors import ekf, imu
+from mavsitl_vehicle.sensors.estimator import SensedEstimator
+from mavsitl_vehicle.sensors.status import EstimatorStatus
 
 if TYPE_CHECKING:
     from mavsitl_vehicle.vehicle import Vehicle
@@ -57,6 +64,8 @@ class Record:
                 (topics.RATES_SETPOINT, lambda v: np.column_stack((ned(v[:, 33:36]), _thrust_frd(v[:, _THRUST])))),
             ),
         )
+        sensed = flight.scenario.estimator.kind == "ekf"
+        self._sensors = SensorRecord(recorder, flight) if sensed else None
         self._weights = recorder.topic(topics.PIDNN_WEIGHTS) if aboard else None
         self._status = recorder.topic(topics.VEHICLE_STATUS)
         self._land = recorder.topic(topics.LAND_DETECTED)
@@ -82,6 +91,8 @@ class Record:
         row[_WIND] = simulation.wind[:, 0]
         row[_INNER] = simulation.inner[tick.RATE_SETPOINT : tick.SATURATED + 1, 0]
         row[_THRUST] = simulation.demand[tick.THRUST, 0]
+        if self._sensors is not None and simulation.sensed is not None:
+            self._sensors.write(now_us, simulation.sensed, autopilot.health)
         if self._weights is not None and vehicle.weights is not None:
             self._weights.append(now_us, *vehicle.weights[:, :, 0].T.ravel().tolist())
         if now_us >= self._ports_due_us:
@@ -107,6 +118,60 @@ class Record:
                 now_us, counted.frames, lost, counted.rejected, dropped,
                 counted.bad_crc, counted.bad_length, counted.unknown_id, counted.incompatible, counted.unsupported,
             )  # fmt: skip
+
+
+class SensorRecord:
+    """What the sensors measured, each row when it came, and what the filter makes of it."""
+
+    def __init__(self, recorder: Recorder, flight: Flight) -> None:
+        scenario = flight.scenario
+        period_us, start = scenario.rates.control_period_us, scenario.start
+        self._period_s = period_us / 1e6
+        self._origin = Origin(start.latitude_deg, start.longitude_deg, start.altitude_amsl_m)
+
+        def combined(v: Array) -> Array:
+            dt = np.full(len(v), period_us)
+            return np.column_stack((ned(v[:, :3]), dt, ned(v[:, 3:]), dt))
+
+        self._imu = Block(recorder, 6, ((topics.SENSOR_COMBINED, combined),))
+        self._gps = recorder.topic(topics.GPS_POSITION)
+        self._air = recorder.topic(topics.AIR_DATA)
+        self._mag = recorder.topic(topics.MAGNETOMETER)
+        self._status = recorder.topic(topics.ESTIMATOR_STATUS)
+        self._bias = recorder.topic(topics.SENSOR_BIAS)
+        self._shown: EstimatorStatus | None = None
+
+    def write(self, now_us: int, sensed: SensedEstimator, health: Health) -> None:
+        if not sensed.now_us:
+            return
+        self._imu.row(now_us)[:] = sensed.imu.state[imu.DELTA : imu.DELTA + 6, 0] / self._period_s
+        origin = self._origin
+        for sensor, came in sensed.came:
+            sampled_us = max(now_us - (sensed.now_us - came.stamp_us), 0)
+            if sensor is sensed.gps:
+                fix = sensed.gps_reading(came)
+                (x, y, z), (vx, vy, vz) = came.values[:3, 0].tolist(), came.values[3:, 0].tolist()
+                eph, epv, evs = (inf, inf, inf) if fix is None else (fix.eph_m, fix.epv_m, fix.evs_m_s)
+                kind = mavlink.GPS_FIX_TYPE_NO_FIX if fix is None else mavlink.GPS_FIX_TYPE_3D_FIX
+                self._gps.append(
+                    now_us, sampled_us, *origin.to_global(x, y), origin.altitude_amsl_m + z, eph, epv, evs,
+                    vx, -vy, -vz, kind, came.satellites,
+                )  # fmt: skip
+            elif sensor is sensed.barometer:
+                altitude = origin.altitude_amsl_m + float(came.values[0, 0])
+                self._air.append(now_us, sampled_us, altitude, 100.0 * atmosphere(altitude)[0])
+            else:
+                mx, my, mz = came.values[:, 0].tolist()
+                self._mag.append(now_us, sampled_us, mx, -my, -mz)
+        status = sensed.status
+        if status is not self._shown:
+            self._shown = status
+            self._status.append(
+                now_us, status.eph_m, status.epv_m, status.velocity_ratio, status.position_ratio, status.height_ratio,
+                status.mag_ratio, estimator_flags(health, status),
+            )  # fmt: skip
+            bx, by, bz, ax, ay, az = sensed.x[ekf.GYRO_BIAS : ekf.GYRO_BIAS + 6, 0].tolist()
+            self._bias.append(now_us, bx, -by, -bz, ax, -ay, -az)
 
 
 def _thrust_frd(thrust: Array) -> Array:

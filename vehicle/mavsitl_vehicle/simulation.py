@@ -18,6 +18,9 @@ from mavsitl_vehicle.failures import Failures
 from mavsitl_vehicle.motors import MotorFailures
 from mavsitl_vehicle.plant.parameters import plant_parameters
 from mavsitl_vehicle.plant.state import initial_state
+from mavsitl_vehicle.sensors import imu
+from mavsitl_vehicle.sensors.estimator import SensedEstimator
+from mavsitl_vehicle.sensors.status import EstimatorStatus, Readings, known
 from mavsitl_vehicle.wind.field import WindField, mil_axes
 
 TURBULENCE_HEIGHT_M = 6.096
@@ -26,14 +29,22 @@ TURBULENCE_HEIGHT_M = 6.096
 BLOCK_TICKS = 250
 """Normals are drawn for this many ticks at once."""
 
+WARM_UP_US = 1_000_000
+"""In so much time at rest a filter uses everything that it has."""
+
 
 class Simulation:
-    """Arrays have the fleet axis last: `x` (17, n) the truth, `estimate` (13, n) what sensors say, `wind` (3, n)."""
+    """Arrays have the fleet axis last: `x` (17, n) the truth, `estimate` (13, n) what sensors say, `wind` (3, n).
+
+    Attributes:
+        sensed: sensors and filter; None: the estimate is the truth with white noise.
+        at_rest: (n,) the vehicle knows that it does not move: on the ground, or in the clamp.
+    """
 
     def __init__(
         self, flight: Flight, parameters: Parameters, seed: int, n: int = 1, failures: Failures | None = None
     ) -> None:
-        """`failures`: of vehicle 0's motors; None: none ever."""
+        """`failures` break the sensors of all `n` vehicles, and vehicle 0's motors; None: nothing is broken."""
         scenario = flight.scenario
         self.n = n
         self._flight = flight
@@ -50,6 +61,7 @@ class Simulation:
         self.demand[tick.ATTITUDE] = 1.0
         self.inner = np.zeros((tick.INNER_ROWS, n))
         self.held = np.full(n, scenario.start.clamp)
+        self.at_rest = np.ones(n, dtype=np.bool_)
         self.gains = _gains(flight, parameters)
         self.sigma = self._sigma()
         self._velocity = self.x[3:6].copy()
@@ -68,8 +80,14 @@ class Simulation:
             self._set_winds(winds)
         self._sensor_block = np.zeros((0, 0, n))
         self._wind_block = np.zeros((0, 0, n))
+        self.sensed: SensedEstimator | None = None
+        self._white = known(scenario.noise)
+        if scenario.estimator.kind == "ekf":
+            self.sensed = self._make_sensed(seed, failures or Failures())
+            self.sensed.present(self.estimate)
         self._draw()
-        self._measure()
+        if self.sensed is None:
+            self._measure()
         self._warm_up()
 
     def set_demand(self, j: int, setpoint: Setpoint | None) -> None:
@@ -91,9 +109,26 @@ class Simulation:
             demand[tick.KIND, j] = tick.TORQUE_KIND
             demand[tick.TORQUE : tick.TORQUE + 3, j] = setpoint.torque
 
+    @property
+    def estimator_status(self) -> EstimatorStatus:
+        """Vehicle 0's."""
+        return self._white if self.sensed is None else self.sensed.status
+
+    @property
+    def readings(self) -> Readings | None:
+        """Vehicle 0's; None: there are no sensors."""
+        return None if self.sensed is None else self.sensed.readings()
+
     def put_back(self) -> None:
-        """At rest at the start pose, rotors still; time, wind and sensors go on."""
+        """At rest at the start pose, rotors still; time, wind and sensors go on, a filter begins anew."""
         self.x[:] = self._start
+        if self.sensed is not None:
+            self.sensed.restart(at_start=True)
+
+    def restart_estimator(self) -> None:
+        """The vehicle boots where it stands."""
+        if self.sensed is not None:
+            self.sensed.restart(at_start=False)
 
     def set_upright(self) -> None:
         """Level and at rest where it lies, with the heading it has, rotors still."""
@@ -102,7 +137,8 @@ class Simulation:
             yaw_rad = to_euler((w, x, y, z))[2]
             here: Vector = tuple(self.x[0:3, j].tolist())
             self.x[:, j] = initial_state(here, yaw_rad, 0.0, 1)[:, 0]
-        self._measure()
+        if self.sensed is None:
+            self._measure()
 
     def set_parameter(self, name: str) -> None:
         """Take up a parameter that was changed in flight; those that are none of the simulation's change nothing."""
@@ -111,6 +147,11 @@ class Simulation:
         elif name == "SIM_NOISE_SCALE":
             self.sigma = self._sigma()
             self.gains = _gains(self._flight, self._parameters)
+            if self.sensed is not None:
+                self.sensed.set_noise()
+        elif name.startswith(("SIM_GYR_", "SIM_ACC_")):
+            if self.sensed is not None:
+                self.sensed.set_noise()
         elif name == "SIM_MASS_SCALE":
             self.plant = self._plant()
         elif name.startswith("SIM_WIND_"):
@@ -189,29 +230,51 @@ class Simulation:
         if row == 0 and self._tick:
             self._draw()
         self._velocity[:] = self.x[3:6]
+        self._tick += 1
         field = self.field
         if self.motors.busy:
-            self.motors.step(self._tick * self.substeps * self.dt_s, self.x[13:17, 0])
+            self.motors.step((self._tick - 1) * self.substeps * self.dt_s, self.x[13:17, 0])
+        if self.sensed is not None:
+            self._advance_sensed(self.sensed, row, flight_time_s)
+            return
         tick.advance(
             self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self.motors.rows,
             self._command, field.state, field.coefficients, self.wind, self._wind_block[row], self._sensor_block[row],
             self.sigma, flight_time_s, self.dt_s, self.substeps,
         )  # fmt: skip
-        self._tick += 1
+
+    def _advance_sensed(self, sensed: SensedEstimator, row: int, flight_time_s: float) -> None:
+        field, unit = self.field, sensed.imu
+        tick.advance_sensed(
+            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self.motors.rows,
+            self._command, field.state, field.coefficients, self.wind, self._wind_block[row], self._sensor_block[row],
+            unit.state, unit.late, unit.settings, unit.added, *sensed.failure_kinds(),
+            flight_time_s, self.dt_s, self.substeps,
+        )  # fmt: skip
+        sensed.update(self.x, self.at_rest, self.estimate)
+
+    def _make_sensed(self, seed: int, failures: Failures) -> SensedEstimator:
+        return SensedEstimator(self._flight, self._parameters, failures, seed, self.x, self.dt_s)
 
     def _draw(self) -> None:
         wind_rows = self.substeps * self.field.normals_per_step
-        sensor_rows = self.substeps * tick.GYRO_NORMALS + tick.MEASURE_NORMALS
+        if self.sensed is None:
+            sensor_rows = self.substeps * tick.GYRO_NORMALS + tick.MEASURE_NORMALS
+            generators = self._sensor_generators
+        else:
+            sensor_rows = (self.substeps + 1) * imu.NORMALS
+            generators = self.sensed.imu.generators
         self._wind_block = np.stack(
             [g.standard_normal((BLOCK_TICKS, wind_rows)) for g in self._wind_generators], axis=-1
         )
-        self._sensor_block = np.stack(
-            [g.standard_normal((BLOCK_TICKS, sensor_rows)) for g in self._sensor_generators], axis=-1
-        )
+        self._sensor_block = np.stack([g.standard_normal((BLOCK_TICKS, sensor_rows)) for g in generators], axis=-1)
 
     def _warm_up(self) -> None:
         """Run each kernel once on copies, so that compiling, or reading the cache, is done before the clock runs."""
         x, estimate, demand, inner = self.x.copy(), self.estimate.copy(), self.demand.copy(), self.inner.copy()
+        if self.sensed is not None:
+            self._warm_up_sensed(x, estimate, demand, inner)
+            return
         for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
             demand[tick.KIND] = kind
             tick.advance(
@@ -220,6 +283,21 @@ class Simulation:
                 self.field.state.copy(), self.field.coefficients, self.wind.copy(),
                 self._wind_block[0], self._sensor_block[0], self.sigma, 0.0, self.dt_s, self.substeps,
             )  # fmt: skip
+
+    def _warm_up_sensed(self, x: tick.Array, estimate: tick.Array, demand: tick.Array, inner: tick.Array) -> None:
+        sensed, field = self._make_sensed(0, Failures()), self.field
+        unit, held = sensed.imu, np.ones(self.n, dtype=np.bool_)
+        while not (sensed.aligned and sensed.now_us >= WARM_UP_US):
+            for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
+                demand[tick.KIND] = kind
+                tick.advance_sensed(
+                    x, estimate, demand, self.gains, inner, held, self.plant, self.motors.rows.copy(),
+                    self._command.copy(),
+                    field.state.copy(), field.coefficients, self.wind.copy(), self._wind_block[0],
+                    self._sensor_block[0], unit.state, unit.late, unit.settings, unit.added, 0, 0,
+                    0.0, self.dt_s, self.substeps,
+                )  # fmt: skip
+            sensed.update(x, held, estimate)
 
     def _measure(self) -> None:
         normals = np.stack([g.standard_normal(tick.MEASURE_NORMALS) for g in self._sensor_generators], axis=-1)

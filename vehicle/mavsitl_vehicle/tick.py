@@ -12,6 +12,7 @@ from mavsitl.compiled import compiled
 from mavsitl.control.allocation import allocate
 from mavsitl_vehicle.autopilot.attitude import attitude_error, quaternion_product
 from mavsitl_vehicle.plant.step import rk4_step
+from mavsitl_vehicle.sensors import imu
 from mavsitl_vehicle.wind.field import wind_step
 
 Array = NDArray[np.float64]
@@ -87,25 +88,24 @@ def rate_setpoint(demand: Array, estimate: Array, gains: Array, inner: Array, j:
 
 @compiled
 def inner_loops(
-    x: Array,
+    gyro: Array,
     demand: Array,
     gains: Array,
     inner: Array,
     held: NDArray[np.bool_],
-    gyro_normals: Array,
     dt_s: float,
     command: Array,
 ) -> None:
     """Rate PID (PX4's form) and allocation (eq 12 inverted) for one physics step.
 
-    Fills `command` (4, n), rotor speeds.
+    `gyro` (3, n) is what the rate loop measures, rad/s FLU. Fills `command` (4, n), rotor speeds.
     """
-    for j in range(x.shape[1]):
+    for j in range(gyro.shape[1]):
         kind = demand[KIND, j]
         if kind == STOPPED:
             for i in range(3):
                 inner[RATE_INTEGRAL + i, j] = 0.0
-                inner[LAST_GYRO + i, j] = x[10 + i, j]
+                inner[LAST_GYRO + i, j] = gyro[i, j]
             for i in range(4):
                 command[i, j] = 0.0
             continue
@@ -113,7 +113,7 @@ def inner_loops(
         if kind == TORQUE_KIND:
             for i in range(3):
                 inner[RATE_INTEGRAL + i, j] = 0.0
-                inner[LAST_GYRO + i, j] = x[10 + i, j]
+                inner[LAST_GYRO + i, j] = gyro[i, j]
             torque = (
                 demand[TORQUE, j] * gains[MAX_TORQUE],
                 demand[TORQUE + 1, j] * gains[MAX_TORQUE + 1],
@@ -122,16 +122,16 @@ def inner_loops(
         else:
             share = (0.0, 0.0, 0.0)
             for i in range(3):
-                gyro = x[10 + i, j] + gains[GYRO_SIGMA] * gyro_normals[i, j]
+                rate = gyro[i, j]
                 setpoint = inner[RATE_SETPOINT + i, j]
-                error = setpoint - gyro if setpoint == setpoint else 0.0
-                acceleration = (gyro - inner[LAST_GYRO + i, j]) / dt_s
+                error = setpoint - rate if setpoint == setpoint else 0.0
+                acceleration = (rate - inner[LAST_GYRO + i, j]) / dt_s
                 value = gains[RATE_P + i] * error + inner[RATE_INTEGRAL + i, j] - gains[RATE_D + i] * acceleration
                 if not held[j]:
                     limit = gains[RATE_INTEGRAL_LIMIT + i]
                     integral = inner[RATE_INTEGRAL + i, j] + gains[RATE_I + i] * error * dt_s
                     inner[RATE_INTEGRAL + i, j] = min(max(integral, -limit), limit)
-                inner[LAST_GYRO + i, j] = gyro
+                inner[LAST_GYRO + i, j] = rate
                 if i == 0:
                     share = (value, share[1], share[2])
                 elif i == 1:
@@ -190,6 +190,18 @@ def measure(x: Array, sigma: Array, normals: Array, estimate: Array) -> None:
 
 
 @compiled
+def outer_loop(demand: Array, estimate: Array, gains: Array, inner: Array) -> None:
+    """Once a tick: the rate setpoint that the rate loop follows during it."""
+    for j in range(demand.shape[1]):
+        inner[SATURATED, j] = 0.0
+        if demand[KIND, j] == ATTITUDE_KIND:
+            rate_setpoint(demand, estimate, gains, inner, j)
+        elif demand[KIND, j] == RATE_KIND:
+            for i in range(3):
+                inner[RATE_SETPOINT + i, j] = demand[RATE + i, j]
+
+
+@compiled
 def advance(
     x: Array,
     estimate: Array,
@@ -214,19 +226,68 @@ def advance(
 
     `wind_normals` (substeps * normals_per_step, n) and `sensor_normals` (substeps * 3 + 12, n) are consumed in order.
     """
-    for j in range(x.shape[1]):
-        inner[SATURATED, j] = 0.0
-        if demand[KIND, j] == ATTITUDE_KIND:
-            rate_setpoint(demand, estimate, gains, inner, j)
-        elif demand[KIND, j] == RATE_KIND:
-            for i in range(3):
-                inner[RATE_SETPOINT + i, j] = demand[RATE + i, j]
+    outer_loop(demand, estimate, gains, inner)
+    gyro = np.empty((3, x.shape[1]))
     per_step = wind_normals.shape[0] // substeps
     for k in range(substeps):
         normals = wind_normals[k * per_step : (k + 1) * per_step]
         wind_step(wind_state, wind_coefficients, normals, time_s + k * dt_s, wind)
-        gyro_normals = sensor_normals[k * GYRO_NORMALS : (k + 1) * GYRO_NORMALS]
-        inner_loops(x, demand, gains, inner, held, gyro_normals, dt_s, command)
+        for j in range(x.shape[1]):
+            for i in range(3):
+                gyro[i, j] = x[10 + i, j] + gains[GYRO_SIGMA] * sensor_normals[k * GYRO_NORMALS + i, j]
+        inner_loops(gyro, demand, gains, inner, held, dt_s, command)
         fail_motors(x, demand, motors, command)
         rk4_step(x, command, wind, plant, dt_s, held)
     measure(x, sigma, sensor_normals[substeps * GYRO_NORMALS :], estimate)
+
+
+@compiled
+def advance_sensed(
+    x: Array,
+    estimate: Array,
+    demand: Array,
+    gains: Array,
+    inner: Array,
+    held: NDArray[np.bool_],
+    plant: Array,
+    motors: Array,
+    command: Array,
+    wind_state: Array,
+    wind_coefficients: Array,
+    wind: Array,
+    wind_normals: Array,
+    imu_normals: Array,
+    imu_state: Array,
+    imu_late: Array,
+    imu_settings: Array,
+    imu_added: Array,
+    gyro_kind: int,
+    accel_kind: int,
+    time_s: float,
+    dt_s: float,
+    substeps: int,
+) -> None:
+    """As `advance`, with the rate loop on the IMU's samples; `estimate` is read alone, the filter writes it.
+
+    `imu_normals` (substeps * 6 + 6, n) are consumed in order; what the IMU integrated is in `imu_state`.
+    """
+    outer_loop(demand, estimate, gains, inner)
+    n = x.shape[1]
+    gyro = np.empty((3, n))
+    before = np.empty((7, n))
+    per_step = wind_normals.shape[0] // substeps
+    imu.begin(imu_state, imu_settings, imu_normals[substeps * imu.NORMALS :])
+    for k in range(substeps):
+        normals = wind_normals[k * per_step : (k + 1) * per_step]
+        wind_step(wind_state, wind_coefficients, normals, time_s + k * dt_s, wind)
+        imu.corrected_gyro(imu_state, gyro)
+        inner_loops(gyro, demand, gains, inner, held, dt_s, command)
+        fail_motors(x, demand, motors, command)
+        for j in range(n):
+            for i in range(7):
+                before[i, j] = x[3 + i, j]
+        rk4_step(x, command, wind, plant, dt_s, held)
+        imu.sample(
+            imu_state, imu_late, imu_settings, imu_added, gyro_kind, accel_kind, before, x,
+            imu_normals[k * imu.NORMALS : (k + 1) * imu.NORMALS], dt_s,
+        )  # fmt: skip

@@ -32,6 +32,7 @@ from mavsitl_vehicle.failures import Change, Failures, Kind, Timeline
 from mavsitl_vehicle.links import LinkControl, initial_links
 from mavsitl_vehicle.mishaps import Mishaps
 from mavsitl_vehicle.record import Record
+from mavsitl_vehicle.sensors.status import Readings
 from mavsitl_vehicle.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -216,6 +217,7 @@ class Vehicle:
             lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures,
         )  # fmt: skip
         autopilot.estimate = self.simulation.estimate[:, 0].tolist()
+        autopilot.estimator_status = self.simulation.estimator_status
         if not self._lockstep:
             autopilot.set_home_here()  # MAVSDK asks for it as soon as it hears the vehicle
         else:
@@ -306,6 +308,7 @@ class Vehicle:
         if not first and now_us:
             if running:
                 simulation.held[0] = autopilot.land.held
+                simulation.at_rest[0] = autopilot.at_rest
                 setpoint = autopilot.decide(now_us - self.period_us)
                 simulation.set_demand(0, self._inner_law(setpoint))
             released_us = autopilot.land.released_us
@@ -313,6 +316,7 @@ class Vehicle:
             simulation.advance(flown_s)
         if running:
             autopilot.estimate = simulation.estimate[:, 0].tolist()
+            autopilot.estimator_status = simulation.estimator_status
             if self._wind is not None:
                 self._wind.update(simulation.estimate, simulation.demand[tick.THRUST, 0], not autopilot.on_ground)
                 autopilot.wind = self._wind.value
@@ -360,6 +364,7 @@ class Vehicle:
         old = self.autopilot
         if not old.health.upright and old.on_ground:
             self.simulation.set_upright()
+        self.simulation.restart_estimator()
         self._boot_us = now_us
         self._mishaps.mend()
         self.plan.stores.transaction = None  # it counts in the old time
@@ -409,6 +414,10 @@ class _Body:
     def true_wind(self) -> Vector:
         x, y, z = self._simulation.wind[:, 0].tolist()
         return x, y, z
+
+    @property
+    def readings(self) -> Readings | None:
+        return self._simulation.readings
 
     @property
     def rotor_speeds_rad_s(self) -> Sequence[float]:

@@ -38,6 +38,7 @@ from mavsitl_vehicle.autopilot.setpoints import (
 from mavsitl_vehicle.autopilot.sticks import Axes
 from mavsitl_vehicle.autopilot.telemetry import AttitudeTarget, FlightTimes, Frozen, Home
 from mavsitl_vehicle.failures import INSTANCES, Failures, Kind, Unit, has_sensors, may_fall_silent
+from mavsitl_vehicle.sensors.status import EstimatorStatus, Readings, known
 
 LIFT_MARGIN_M = 0.1
 """An off-board position so far above the vehicle asks to leave the ground."""
@@ -68,6 +69,8 @@ class Body(Protocol):
     def specific_force_flu_m_s2(self) -> Vector: ...
     @property
     def rate_setpoint_flu_rad_s(self) -> Vector: ...
+    @property
+    def readings(self) -> Readings | None: ...
 
 
 class Autopilot:
@@ -100,7 +103,8 @@ class Autopilot:
         self.commander = Commander(parameters, self.say)
         self.estimate: list[float] = [0.0] * 6 + [1.0] + [0.0] * 6
         """Position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s: what telemetry says."""
-        self.accuracy = telemetry.accuracy(scenario.noise)
+        self._status = known(scenario.noise)
+        self.accuracy = telemetry.accuracy(self._status)
         start = scenario.start
         self.origin = Origin(start.latitude_deg, start.longitude_deg, start.altitude_amsl_m)
         self.home: Home | None = None
@@ -130,7 +134,8 @@ class Autopilot:
             parameters, self._gravity, period_s, MissionCourse(shared.plan, parameters, self), self._say
         )
         self.pilot = Pilot(parameters, self._gravity, self._hover_thrust, period_s)
-        self.land = LandDetector(self._hover_thrust, period_s, clamped=start.clamp)
+        knows_height = scenario.estimator.kind == "white-noise"
+        self.land = LandDetector(self._hover_thrust, period_s, clamped=start.clamp, knows_height=knows_height)
         self._armed_at_us = 0
         self._flown: Mode | None = None
         """The mode flown in the last period; None: disarmed."""
@@ -258,6 +263,24 @@ class Autopilot:
     def _on_set_origin(self, message: Message, frame: Frame, now_us: int) -> None:
         """As on PX4 the origin of a vehicle with GPS is the GPS's: said, not changed."""
         self.warn("origin", "Origin refused: it is the simulator's")
+
+    # --- what the estimator knows ------------------------------------------------------------------------------------
+
+    @property
+    def estimator_status(self) -> EstimatorStatus:
+        """How well `estimate` is known, from whoever sets both."""
+        return self._status
+
+    @estimator_status.setter
+    def estimator_status(self, status: EstimatorStatus) -> None:
+        if status is not self._status:
+            self._status = status
+            self.accuracy = telemetry.accuracy(status)
+
+    @property
+    def at_rest(self) -> bool:
+        """It does not move, and knows it: in the clamp, or disarmed on the ground."""
+        return self.land.held or (self.land.on_ground and not self.commander.armed)
 
     # --- what commands need ------------------------------------------------------------------------------------------
 
@@ -406,6 +429,10 @@ class Autopilot:
     @property
     def specific_force_flu_m_s2(self) -> Vector:
         return self.body.specific_force_flu_m_s2
+
+    @property
+    def readings(self) -> Readings | None:
+        return self.body.readings
 
     @property
     def attitude_target(self) -> AttitudeTarget | None:
@@ -590,7 +617,16 @@ class Autopilot:
         x, y, z = self.estimate[:3]
         self._fence_breach = self._plan_watch.breach((x, y, z))
         mode = modes.TABLE[self.commander.intended]
+        status, sensors = self._status, self._status.sensors
         self.health = Health(
+            gyro=sensors.gyro,
+            accelerometer=sensors.accelerometer,
+            magnetometer=sensors.magnetometer,
+            barometer=sensors.barometer,
+            gps=sensors.gps,
+            attitude=status.attitude_valid,
+            height=status.height_valid,
+            position=status.position_valid,
             battery=self.battery.level < Level.CRITICAL,
             motors=not self.failed_motors,
             upright=_upright(self.estimate[7], self.estimate[8]),

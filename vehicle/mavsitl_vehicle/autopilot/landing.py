@@ -20,6 +20,8 @@ LANDED_HEIGHT_M = 0.05
 LANDED_SPEED_M_S = 0.15
 AIRBORNE_HEIGHT_M = 0.15
 LANDING_TIME_US = 300_000
+UNSURE_LANDING_TIME_US = 1_000_000
+"""Where the height is not known to a few centimetres (PX4's LNDMC_TRIG_TIME)."""
 FILTER_S = 0.3
 
 
@@ -32,11 +34,16 @@ class LandDetector:
         released_us: when the clamp opened or the take-off began, the flight's time zero; None: not yet.
     """
 
-    def __init__(self, hover_thrust: float, period_s: float, *, clamped: bool) -> None:
+    def __init__(self, hover_thrust: float, period_s: float, *, clamped: bool, knows_height: bool = True) -> None:
+        """`knows_height`: the ground is at height 0. Else the take-off tells where it was, and a landing is what
+        stands still on little thrust.
+        """
         self.state = ON_GROUND
         self.held = clamped
         self.released_us: int | None = None
         self._hover_thrust = hover_thrust
+        self._knows_height = knows_height
+        self._ground_m = 0.0
         self._still_since_us: int | None = None
         self._smooth = (0.0, 0.0, 0.0, 0.0)
         """Height and velocity, with the sensors' noise filtered out."""
@@ -64,28 +71,33 @@ class LandDetector:
         )
         if self.state != ON_GROUND:
             if armed or not self.held:
-                self._watch(now_us, landing or not armed or thrust < LOW_THRUST_SHARE * self._hover_thrust)
+                little = not armed or thrust < LOW_THRUST_SHARE * self._hover_thrust
+                self._watch(now_us, little or (landing and self._knows_height))
             return False
         if not (armed and ready and thrust >= TAKEOFF_THRUST_SHARE * self._hover_thrust):
             return False
         self.state = IN_AIR if self.held else TAKING_OFF
         self.held = False
         self.released_us = now_us
+        if not self._knows_height:
+            self._ground_m = self._smooth[0]
         self._still_since_us = None
         return True
 
     def _watch(self, now_us: int, landing: bool) -> None:
         z, vx, vy, vz = self._smooth
-        if z > AIRBORNE_HEIGHT_M:
+        if z - self._ground_m > AIRBORNE_HEIGHT_M:
             self.state = IN_AIR
-            self._still_since_us = None
-            return
-        still = z < LANDED_HEIGHT_M and abs(vz) < LANDED_SPEED_M_S and hypot(vx, vy) < LANDED_SPEED_M_S
+            if self._knows_height:
+                self._still_since_us = None
+                return
+        low = z < LANDED_HEIGHT_M or not self._knows_height
+        still = low and abs(vz) < LANDED_SPEED_M_S and hypot(vx, vy) < LANDED_SPEED_M_S
         if not (still and landing):
             self._still_since_us = None
         elif self._still_since_us is None:
             self._still_since_us = now_us
-        elif now_us - self._still_since_us >= LANDING_TIME_US:
+        elif now_us - self._still_since_us >= (LANDING_TIME_US if self._knows_height else UNSURE_LANDING_TIME_US):
             self.state = ON_GROUND
 
     def put_back(self) -> None:

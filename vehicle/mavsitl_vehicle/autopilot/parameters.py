@@ -497,6 +497,16 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
         _real("SENS_BOARD_Z_OFF", 0, -45, 45, "deg", "Yaw of the board", decimals=1, used_by="client"),
     ),
     _group(
+        "EKF2",
+        _int("EKF2_NOAID_TOUT", 5_000_000, 500_000, 10_000_000, "us",
+             "Position and velocity are not valid any more after so long without GPS",
+             "These act with estimator.kind = \"ekf\" alone."),
+        _real("EKF2_GPS_P_GATE", 5, 1, 100, "SD", "A GPS position farther off than this is refused", decimals=1),
+        _real("EKF2_GPS_V_GATE", 5, 1, 100, "SD", "A GPS velocity farther off than this is refused", decimals=1),
+        _real("EKF2_BARO_GATE", 5, 1, 100, "SD", "A barometer's height farther off than this is refused", decimals=1),
+        _real("EKF2_MAG_GATE", 3, 1, 100, "SD", "A magnetic field farther off than this is refused", decimals=1),
+    ),
+    _group(
         "Radio",
         *(_choice(f"RC_MAP_{name}", 0, _CHANNELS, f"Channel of {text}", used_by="client") for name, text in (
             ("ROLL", "roll"), ("PITCH", "pitch"), ("YAW", "yaw"), ("THROTTLE", "throttle"),
@@ -512,7 +522,21 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
         _switch("SIM_WIND_TURB", 0, "Dryden turbulence (MIL-F-8785C) of SIM_WIND_W20, added to the scenario's"),
         _real("SIM_WIND_W20", 10, 0.1, 40, "m/s", "Wind at 20 ft (6 m), which sets the turbulence's intensity",
               decimals=1),
-        _real("SIM_NOISE_SCALE", 1, 0, 100, "", "Factor on the scenario's sensor noise"),
+        _real("SIM_NOISE_SCALE", 1, 0, 100, "", "Factor on the scenario's sensor noise",
+              "Of the EKF's sensors, on the noise of each measurement; the filter is not told."),
+        _int("SIM_GPS_USED", 10, 0, 50, "", "Satellites that the receiver uses",
+             "Below 4 it has no fix, below 6 the filter does not use it. This and those below act with "
+             "estimator.kind = \"ekf\" alone."),
+        _real("SIM_GPS_JAM", 0, 0, 1, "norm", "Jamming: share of the satellites lost; noise up to 31 times as large"),
+        *(_real(f"SIM_GPS_GLITCH_{axis}", 0, -100_000, 100_000, "m", f"GPS spoofed: offset {text}", decimals=1)
+          for axis, text in (("N", "north"), ("E", "east"), ("D", "down"))),
+        _real("SIM_BARO_OFF_P", 0, -10_000, 10_000, "Pa", "Added to the barometer's pressure", decimals=1),
+        *(_real(f"SIM_MAG_OFFSET_{axis}", 0, -10, 10, "gauss", f"Added to the magnetometer's {axis} (FRD)", decimals=3)
+          for axis in "XYZ"),
+        *(_real(f"SIM_GYR_BIAS_{axis}", 0, -10, 10, "rad/s", f"Added to the gyro's {axis} (FRD)", decimals=3,
+                note="ArduPilot: SIM_GYR1_BIAS") for axis in "XYZ"),
+        *(_real(f"SIM_ACC_BIAS_{axis}", 0, -50, 50, "m/s^2", f"Added to the accelerometer's {axis} (FRD)", decimals=2,
+                note="ArduPilot: SIM_ACC1_BIAS") for axis in "XYZ"),
         _real("SIM_MASS_SCALE", 1, 0.2, 5, "", "Factor on the vehicle's mass, which the controller does not know",
               "On top of the scenario's offnominal.mass_scale."),
         _switch("SIM_BAT_ENABLE", 1, "The battery drains", "Off: it stays as it is."),

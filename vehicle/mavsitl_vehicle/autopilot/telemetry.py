@@ -15,7 +15,6 @@ from mavsitl.frames import Quaternion, Vector, flip_quaternion, flip_vector
 from mavsitl.geodesy import Origin
 from mavsitl.node import Node
 from mavsitl.quaternion import conjugate, from_yaw, rotate, to_euler
-from mavsitl.scenario import Noise
 from mavsitl.wire_units import (
     INT16_MAX,
     UINT8_MAX,
@@ -42,6 +41,7 @@ from mavsitl_vehicle.autopilot.health import Health
 from mavsitl_vehicle.autopilot.modes import Mode
 from mavsitl_vehicle.autopilot.setpoints import PositionSetpoint
 from mavsitl_vehicle.autopilot.sticks import Axes
+from mavsitl_vehicle.sensors.status import EstimatorStatus, GpsReading, Readings
 
 # --- what is told ----------------------------------------------------------------------------------------------------
 
@@ -111,14 +111,15 @@ class Accuracy(NamedTuple):
 _DIAGONAL = (0, 6, 11, 15, 18, 20)
 
 
-def accuracy(noise: Noise) -> Accuracy:
-    """Of an estimate that carries the scenario's noise. As from PX4, only the variances are known."""
+def accuracy(status: EstimatorStatus) -> Accuracy:
+    """Of an estimate that is known so well. As from PX4, only the variances are told."""
     pose, velocity = [nan] * 21, [nan] * 21
-    attitude, rate = noise.attitude_deg * pi / 180.0, noise.rate_deg_s * pi / 180.0
-    for place, index in enumerate(_DIAGONAL):
-        sigma, sigma_rate = (noise.position_m, noise.velocity_m_s) if place < 3 else (attitude, rate)
+    h, v, tilt = status.eph_m, status.evh_m_s, status.tilt_rad
+    sigmas = (h, h, status.epv_m, tilt, tilt, status.heading_rad)
+    rates = (v, v, status.evv_m_s, status.rate_rad_s, status.rate_rad_s, status.rate_rad_s)
+    for index, sigma, sigma_rate in zip(_DIAGONAL, sigmas, rates, strict=True):
         pose[index], velocity[index] = sigma * sigma, sigma_rate * sigma_rate
-    return Accuracy(noise.position_m, noise.velocity_m_s, pose, velocity)
+    return Accuracy(h, v, pose, velocity)
 
 
 class CommanderView(Protocol):
@@ -173,6 +174,13 @@ class Subject(Protocol):
 
     @property
     def accuracy(self) -> Accuracy: ...
+
+    @property
+    def estimator_status(self) -> EstimatorStatus: ...
+
+    @property
+    def readings(self) -> Readings | None:
+        """Of the sensors; None: there are none, and what they would measure is made of the estimate."""
 
     @property
     def specific_force_flu_m_s2(self) -> Vector:
@@ -547,22 +555,33 @@ _NO_YAW = 0
 
 
 def send_gps_raw_int(subject: Subject, node: Node, now_us: int) -> bool:
-    """The receiver is as good as the estimate; with a GPS fault it has no fix and says so."""
-    if not subject.health.gps:
+    """As the receiver tells it; without sensors it is as good as the estimate. With a fault it has no fix."""
+    readings = subject.readings
+    if readings is not None:
+        fix = readings.gps
+    elif subject.health.gps:
+        e, quality = subject.estimate, subject.accuracy
+        fix = GpsReading(
+            (e[0], e[1], e[2]), (e[3], e[4], e[5]), _SATELLITES,
+            quality.position_m, quality.position_m, quality.velocity_m_s, 0,
+        )  # fmt: skip
+    else:
+        fix = None
+    if fix is None:
         node.send(
             _GPS_RAW_INT, now_us, mavlink.GPS_FIX_TYPE_NO_FIX, 0, 0, 0, UINT16_MAX, UINT16_MAX, UINT16_MAX, UINT16_MAX,
             0,
         )  # fmt: skip
         return True
-    e, origin, quality = subject.estimate, subject.origin, subject.accuracy
-    lat, lon = origin.to_global(e[0], e[1])
-    altitude_mm = millimetres(origin.altitude_amsl_m + e[2])
-    course_rad = atan2(-e[4], e[3])
-    position_mm, velocity_mm_s = millimetres_unsigned(quality.position_m), millimetres_unsigned(quality.velocity_m_s)
+    origin = subject.origin
+    (x, y, z), (vx, vy, _) = fix.position_nwu_m, fix.velocity_nwu_m_s
+    lat, lon = origin.to_global(x, y)
+    altitude_mm = millimetres(origin.altitude_amsl_m + z)
     node.send(
-        _GPS_RAW_INT, now_us, mavlink.GPS_FIX_TYPE_3D_FIX, deg_e7(lat), deg_e7(lon), altitude_mm,
-        _HDOP_CENTI, _VDOP_CENTI, centimetres_per_s_unsigned(hypot(e[3], e[4])), heading_cdeg(course_rad), _SATELLITES,
-        altitude_mm, position_mm, position_mm, velocity_mm_s, 0, _NO_YAW,
+        _GPS_RAW_INT, max(now_us - fix.age_us, 0), mavlink.GPS_FIX_TYPE_3D_FIX, deg_e7(lat), deg_e7(lon), altitude_mm,
+        _HDOP_CENTI, _VDOP_CENTI, centimetres_per_s_unsigned(hypot(vx, vy)), heading_cdeg(atan2(-vy, vx)),
+        fix.satellites, altitude_mm, millimetres_unsigned(fix.eph_m), millimetres_unsigned(fix.epv_m),
+        millimetres_unsigned(fix.evs_m_s), 0, _NO_YAW,
     )  # fmt: skip
     return True
 
@@ -633,16 +652,23 @@ _POSITION_FLAGS: int = (
 )
 
 
-def send_estimator_status(subject: Subject, node: Node, now_us: int) -> bool:
-    """No filter runs: the innovation ratios are 0, and those of sensors that are not there unknown."""
-    health, quality = subject.health, subject.accuracy
-    flags = (
+def estimator_flags(health: Health, status: EstimatorStatus) -> int:
+    """ESTIMATOR_STATUS_FLAGS"""
+    flags: int = (
         (_ATTITUDE_FLAGS if health.attitude else 0)
         | (_HEIGHT_FLAGS if health.height else 0)
         | (_POSITION_FLAGS if health.position else mavlink.ESTIMATOR_CONST_POS_MODE)
+        | (mavlink.ESTIMATOR_GPS_GLITCH if status.position_ratio > 1.0 else 0)
     )
+    return flags
+
+
+def send_estimator_status(subject: Subject, node: Node, now_us: int) -> bool:
+    """Ratios of 0 where no filter runs; those of sensors that are not there are unknown."""
+    status = subject.estimator_status
     node.send(
-        _ESTIMATOR_STATUS, now_us, flags, 0.0, 0.0, 0.0, 0.0, nan, nan, quality.position_m, quality.position_m
+        _ESTIMATOR_STATUS, now_us, estimator_flags(subject.health, status), status.velocity_ratio,
+        status.position_ratio, status.height_ratio, status.mag_ratio, nan, nan, status.eph_m, status.epv_m,
     )  # fmt: skip
     return True
 
@@ -683,15 +709,26 @@ _FIELDS_UPDATED = 0b1_1011_1111_1111
 """All but differential pressure."""
 
 
+def _sensed(subject: Subject) -> tuple[Vector, Vector, Vector, float]:
+    """Rate rad/s, specific force m/s^2 and field gauss (FLU), and the altitude that the barometer shows, m."""
+    readings, e, origin = subject.readings, subject.estimate, subject.origin
+    field, height = None, None
+    if readings is None:
+        rate, force = (e[10], e[11], e[12]), subject.specific_force_flu_m_s2
+    else:
+        rate, force = readings.gyro_flu_rad_s, readings.accel_flu_m_s2
+        field, height = readings.mag_flu_gauss, readings.baro_height_m
+    if field is None:
+        field = rotate(conjugate((e[6], e[7], e[8], e[9])), origin.magnetic_field_nwu_gauss)
+    return rate, force, field, origin.altitude_amsl_m + (e[2] if height is None else height)
+
+
 def send_highres_imu(subject: Subject, node: Node, now_us: int) -> bool:
     """FRD; the accelerometer measures specific force, -g about z at rest."""
-    e, origin = subject.estimate, subject.origin
-    ax, ay, az = subject.specific_force_flu_m_s2
-    mx, my, mz = rotate(conjugate((e[6], e[7], e[8], e[9])), origin.magnetic_field_nwu_gauss)
-    altitude = origin.altitude_amsl_m + e[2]
+    (p, q, r), (ax, ay, az), (mx, my, mz), altitude = _sensed(subject)
     pressure, temperature = atmosphere(altitude)
     node.send(
-        _HIGHRES_IMU, now_us, ax, -ay, -az, e[10], -e[11], -e[12], mx, -my, -mz,
+        _HIGHRES_IMU, now_us, ax, -ay, -az, p, -q, -r, mx, -my, -mz,
         pressure, 0.0, altitude, temperature, _FIELDS_UPDATED,
     )  # fmt: skip
     return True
@@ -701,7 +738,7 @@ _SCALED_PRESSURE = _pack("scaled_pressure")
 
 
 def send_scaled_pressure(subject: Subject, node: Node, now_us: int) -> bool:
-    pressure, temperature = atmosphere(subject.origin.altitude_amsl_m + subject.estimate[2])
+    pressure, temperature = atmosphere(_sensed(subject)[3])
     node.send(_SCALED_PRESSURE, boot_ms(now_us), pressure, 0.0, centi_celsius(temperature), 0)
     return True
 
@@ -974,7 +1011,7 @@ STREAMS: tuple[Stream, ...] = tuple(
         Stream("SYSTEM_TIME", send_system_time, 1, 1, 0, 1),
         Stream("HOME_POSITION", send_home_position, 1, 1, 0.5, 0.5, "once home is set"),
         Stream("GPS_GLOBAL_ORIGIN", send_gps_global_origin, 1, 1, 1, 1),
-        Stream("ESTIMATOR_STATUS", send_estimator_status, 0.5, 1, 0.5, 1, "no filter: ratios 0"),
+        Stream("ESTIMATOR_STATUS", send_estimator_status, 0.5, 1, 0.5, 1, "without a filter: ratios 0"),
         Stream("SCALED_PRESSURE", send_scaled_pressure, 1, 1, 1, 1, "standard atmosphere"),
         Stream("MISSION_CURRENT", send_mission_current, ON_REQUEST, ON_REQUEST, 1, 1),
         Stream("BATTERY_STATUS", send_battery_status, 0.5, 0.5, 0.5, 0.5),
