@@ -610,8 +610,8 @@ def _fly(options: argparse.Namespace) -> int:
                 alone = [other.name for other in flights].count(flight.name) == 1
                 title = flight.name if alone else f"{flight.name}-{index + 1}"
                 task = bar.add_task(f"{title:20s}", total=flight.scenario.duration_s, said="starting")
-                outcome, speed = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task, pair)
-                records.append(runs.record(flight, folder=title, wire_hash=outcome, real_time_factor=speed))
+                flown = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task, pair)
+                records.append(runs.record(flight, folder=title, **flown))
                 runs.write_run(folder, runs.new_run("mavsitl " + " ".join(sys.argv[1:]), created, tuple(records)))
     except KeyboardInterrupt:
         console.print(f"interrupted; the logs so far are in {folder}")
@@ -621,8 +621,8 @@ def _fly(options: argparse.Namespace) -> int:
 
 def _fly_one(
     name: str, flight: Flight, settings: list[str], folder: Path, memory: bool, bar: RichProgress, task: Any, pair: Any
-) -> tuple[str, float]:
-    """One flight; the hash of its wire and how much faster than real time it went."""
+) -> dict[str, Any]:
+    """One flight; what `run.record` wants to know of it."""
 
     def move(time_s: float) -> None:
         bar.update(task, completed=max(time_s, 0.0), said=f"{max(time_s, 0.0):5.1f} s")
@@ -639,12 +639,13 @@ def _fly_one(
         outcome = ends.in_memory(flight, folder, report=lambda text: bar.update(task, said=text), progress=move)
         if not outcome.finished:
             raise pair.PairError(f"{flight.name}: the flight did not end as planned")
-        wire_hash, speed = outcome.wire_hash, outcome.speed
+        wire_hash, speed, dropped, links = outcome.wire_hash, outcome.speed, outcome.dropped, outcome.links
     else:
-        result = pair.fly(name, settings, folder, on_event)
-        wire_hash, speed = result.vehicle["wire_hash"], result.vehicle["speed"]
+        said = pair.fly(name, settings, folder, on_event).vehicle
+        wire_hash, speed, dropped = said["wire_hash"], said["speed"], said["dropped"]
+        links = {"link": said["link"]} if "link" in said else {}
     bar.update(task, completed=flight.scenario.duration_s, said=f"{speed:.0f} x real time")
-    return wire_hash, speed
+    return {"wire_hash": wire_hash, "real_time_factor": speed, "links": links, "dropped": dropped}
 
 
 def _show(console: Any, options: argparse.Namespace, folder: Path, records: list[FlightRecord]) -> int:
@@ -678,6 +679,8 @@ def _show(console: Any, options: argparse.Namespace, folder: Path, records: list
                 style = {"beaten": "green", "met": "green", "missed": "yellow"}.get(row.verdict or "", "")
                 table.add_row(row.state, tables.number(row.ours), paper, f"[{style}]{ratio}[/]" if style else ratio)
             console.print(table)
+            for link in tables.link_rows(record.links):
+                console.print(f"link {link}", soft_wrap=True, highlight=False)
     if not options.no_report:
         from mavsitl.report.html import write_report
 
@@ -1033,7 +1036,7 @@ def _link(options: argparse.Namespace) -> int:
     task = ParameterTask([(prefix + name, wanted.get(name)) for name in names])
     reply = _ask(options, task, ends.OFFBOARD_PORT if options.gcs else None)
     if not reply.ok and reply.vehicle is not None and wanted.get("DOWN"):
-        other = ends.GCS_PORT if options.gcs else ends.OFFBOARD_PORT
+        other = options.instance + (ends.OFFBOARD_PORT if options.gcs else ends.GCS_PORT)
         hint = f"an outage of the link that is spoken on has no answer; over --endpoint udpout:127.0.0.1:{other} it has"
         reply = _replace(reply, problem=f"{reply.problem} ({hint})")
 

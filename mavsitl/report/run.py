@@ -39,6 +39,10 @@ class FlightRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """The key of `PAPER_TABLES` that the flight answers to."""
     wind: tuple[str, ...] = ()
     """Wind models; empty in calm air."""
+    links: dict[str, dict[str, dict[str, float]]] = {}
+    """What the vehicle's impaired links did, by place and direction: `mavsitl.link.impaired.Statistics`."""
+    dropped: dict[str, int] = {}
+    """Input of the vehicle that was not taken, by reason: `mavsitl.codec.Counters`."""
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -53,7 +57,15 @@ def new_run(command: str, created_utc: str, flights: tuple[FlightRecord, ...]) -
     return Run(version=mavsitl.__version__, command=command, created_utc=created_utc, flights=flights)
 
 
-def record(flight: Flight, *, folder: str, wire_hash: str, real_time_factor: float | None) -> FlightRecord:
+def record(
+    flight: Flight,
+    *,
+    folder: str,
+    wire_hash: str,
+    real_time_factor: float | None,
+    links: dict[str, dict[str, dict[str, float]]] | None = None,
+    dropped: dict[str, int] | None = None,
+) -> FlightRecord:
     """What `run.json` says of a flight."""
     scenario = flight.scenario
     return FlightRecord(
@@ -73,6 +85,8 @@ def record(flight: Flight, *, folder: str, wire_hash: str, real_time_factor: flo
         duration_s=scenario.duration_s,
         paper_case=paper_case(scenario),
         wind=tuple(str(model.__struct_config__.tag) for model in scenario.wind),
+        links=links or {},
+        dropped=dropped or {},
     )
 
 
