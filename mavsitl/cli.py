@@ -146,7 +146,7 @@ examples:
 """
 
 INJECT_HELP = """\
-Break a part of a running vehicle, or mend it: MAV_CMD_INJECT_FAILURE, which every PX4-like vehicle answers. UNIT and
+Break a part of a running vehicle, or mend it, by MAV_CMD_INJECT_FAILURE, which PX4 has in its simulations too. UNIT and
 TYPE are MAVLink's FAILURE_UNIT and FAILURE_TYPE, INSTANCE counts from 1; 0 is all. SYS_FAILURE_EN must be 1. What a
 vehicle cannot do it answers with UNSUPPORTED.
 """
@@ -185,9 +185,6 @@ LINK_OPTIONS = {
     "reorder": "REORD", "duplicate": "DUP", "corrupt": "CORR", "bandwidth": "BW", "down": "DOWN",
 }  # fmt: skip
 """Option to the end of the parameter's name, in the order in which they are set: an outage last."""
-
-GOOD_MS = 2000.0
-"""Between two bursts, where nobody says anything else."""
 
 
 class UsageError(ValueError):
@@ -1022,12 +1019,14 @@ def _replace(reply: Reply, **changes: Any) -> Reply:
 def _link(options: argparse.Namespace) -> int:
     from mavsitl import ends
     from mavsitl.ask import ParameterTask
-    from mavsitl.link.settings import PREFIXES
+    from mavsitl.link.settings import PREFIXES, initial
+    from mavsitl.scenario import LinkModel
 
     prefix = PREFIXES["gcs_link" if options.gcs else "link"]
     wanted: dict[str, float] = {}
     if options.reset:
-        wanted = {name: GOOD_MS if name == "GOOD" else 0.0 for name in LINK_OPTIONS.values()}
+        perfect = initial(LinkModel())
+        wanted = {name: perfect[name] for name in LINK_OPTIONS.values()}
     for option, name in LINK_OPTIONS.items():
         value = getattr(options, option)
         if value is not None:
