@@ -141,7 +141,8 @@ examples:
   mavsitl link                                       the present settings
   mavsitl link --latency 40 --jitter 10 --loss 0.05
   mavsitl link --burst 200 --direction to-vehicle
-  mavsitl link --down; sleep 2; mavsitl link --up    an outage
+  mavsitl link --down                                an outage, until
+  mavsitl link --up
   mavsitl link --gcs --reset
 """
 
@@ -169,7 +170,7 @@ PARAM_EXAMPLES = """\
 examples:
   mavsitl param get COM_OF_LOSS_T NAV_DLL_ACT
   mavsitl param set COM_OF_LOSS_T=0.5
-  mavsitl param list 'SIM_*'
+  mavsitl param list "SIM_*"
 """
 
 ASK_EPILOG = """

@@ -9,10 +9,14 @@ from typing import Any
 
 import pytest
 
-from mavsitl import ends
-from mavsitl.ask import CommandTask, ListTask, ParameterTask, Reply
+from mavsitl import drivers, ends
+from mavsitl.ask import Ask, CommandTask, ListTask, ParameterTask, Reply
 from mavsitl.cli import main
+from mavsitl.codec import encode
+from mavsitl.dialect import mavlink
 from mavsitl.link.address import Address
+from mavsitl.link.base import Source
+from mavsitl.link.memory import MemoryLink
 from mavsitl.link.udp import LOOPBACK
 from mavsitl.pair import free_ports
 
@@ -143,6 +147,30 @@ def test_a_negative_loss_is_no_loss(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["link", "--loss", "-1"])
     assert "a finite number, 0 or more" in capsys.readouterr().err
+
+
+class Late(MemoryLink):
+    """Like a TCP client: by `receive` it tries to connect, at the third time with success; before that, nothing comes."""
+
+    def __init__(self) -> None:
+        super().__init__("late", 100)
+        self.tries = 0
+
+    def wait(self, timeout_s: float) -> bool:
+        return self.tries >= 3
+
+    def receive(self, now_us: int, limit: int = 256) -> list[tuple[bytes, Source]]:
+        self.tries += 1
+        messages = (
+            mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3), mavlink.MAVLink_param_value_message(b"A", 1.0, 9, 1, 0)
+        )  # fmt: skip
+        return [(encode(message, 0, 1, 1), ("late",)) for message in messages] if self.tries >= 3 else []
+
+
+def test_a_server_may_come_later() -> None:
+    asking = Ask(ListTask(), patience_us=60_000_000)
+    drivers.run_ask(asking, Late())
+    assert asking.reply() == Reply(ok=True, vehicle=1, parameters={"A": 1.0}, result="", texts=(), problem="")
 
 
 @pytest.mark.sockets
