@@ -150,7 +150,7 @@ def test_a_negative_loss_is_no_loss(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 class Late(MemoryLink):
-    """Like a TCP client: by `receive` it tries to connect, at the third time with success; before that, nothing comes."""
+    """Like a TCP client: it tries to connect by `receive`, at the third time with success."""
 
     def __init__(self) -> None:
         super().__init__("late", 100)
@@ -161,9 +161,8 @@ class Late(MemoryLink):
 
     def receive(self, now_us: int, limit: int = 256) -> list[tuple[bytes, Source]]:
         self.tries += 1
-        messages = (
-            mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3), mavlink.MAVLink_param_value_message(b"A", 1.0, 9, 1, 0)
-        )  # fmt: skip
+        value = mavlink.MAVLink_param_value_message(b"A", 1.0, 9, 1, 0)
+        messages = (mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3), value)
         return [(encode(message, 0, 1, 1), ("late",)) for message in messages] if self.tries >= 3 else []
 
 
