@@ -16,7 +16,13 @@ from mavsitl.dialect import mavlink
 from mavsitl.node import Node
 from mavsitl.services.base import Peer
 from mavsitl.services.command import CommandClient
-from mavsitl.services.parameter import HASH_CHECK, ParameterClient, Request
+from mavsitl.services.parameter import (
+    HASH_CHECK,
+    TYPE_MISMATCH,
+    TYPE_UNSUPPORTED,
+    ParameterClient,
+    Request,
+)
 from mavsitl.services.statustext import Joiner
 
 __all__ = ["Ask", "CommandTask", "ListTask", "ParameterTask", "Reply", "Task", "failure_kinds", "failure_units"]
@@ -124,9 +130,15 @@ class ParameterTask:
             return f"has no parameter {failed.name}"
         if failed.outcome == "silent":
             return f"does not answer for {failed.name}: it has no such parameter, or the link is cut"
-        why = "" if failed.error is None else f" ({_enum('MAV_PARAM_ERROR', failed.error)})"
-        held = "" if failed.value is None else f"; it is {failed.value:g}"
-        return f"refuses {failed.name} = {failed.wanted:g}{why}{held}"
+        held = "" if failed.value is None else f"; it says {failed.value:g}"
+        if failed.error is None:
+            return f"does not confirm {failed.name} = {failed.wanted:g}{held}"
+        why = _ERRORS.get(failed.error) or _enum("MAV_PARAM_ERROR", failed.error)
+        return f"refuses {failed.name} = {failed.wanted:g} ({why}){held}"
+
+
+_ERRORS = {TYPE_UNSUPPORTED: "TYPE_UNSUPPORTED", TYPE_MISMATCH: "TYPE_MISMATCH"}
+"""Those of MAV_PARAM_ERROR that pymavlink does not have."""
 
 
 class ListTask:

@@ -153,12 +153,13 @@ examples:
   mavsitl link                                       the present settings
   mavsitl link --latency 40 --jitter 10 --loss 0.05
   mavsitl link --burst 200 --direction to-vehicle
-  mavsitl link --down; sleep 2; mavsitl link --up    an outage
+  mavsitl link --down                                an outage, until
+  mavsitl link --up
   mavsitl link --gcs --reset
 """
 
 INJECT_HELP = """\
-Break a part of a running vehicle, or mend it: MAV_CMD_INJECT_FAILURE, which every PX4-like vehicle answers. UNIT and
+Break a part of a running vehicle, or mend it, by MAV_CMD_INJECT_FAILURE, which PX4 has in its simulations too. UNIT and
 TYPE are MAVLink's FAILURE_UNIT and FAILURE_TYPE, INSTANCE counts from 1; 0 is all. SYS_FAILURE_EN must be 1. What a
 vehicle cannot do it answers with UNSUPPORTED.
 """
@@ -181,7 +182,7 @@ PARAM_EXAMPLES = """\
 examples:
   mavsitl param get COM_OF_LOSS_T NAV_DLL_ACT
   mavsitl param set COM_OF_LOSS_T=0.5
-  mavsitl param list 'SIM_*'
+  mavsitl param list "SIM_*"
 """
 
 ASK_EPILOG = """
@@ -197,9 +198,6 @@ LINK_OPTIONS = {
     "reorder": "REORD", "duplicate": "DUP", "corrupt": "CORR", "bandwidth": "BW", "down": "DOWN",
 }  # fmt: skip
 """Option to the end of the parameter's name, in the order in which they are set: an outage last."""
-
-GOOD_MS = 2000.0
-"""Between two bursts, where nobody says anything else."""
 
 
 class UsageError(ValueError):
@@ -656,10 +654,7 @@ def _fly(options: argparse.Namespace) -> int:
                 title = flight.name if alone else f"{flight.name}-{index + 1}"
                 task = bar.add_task(f"{title:20s}", total=flight.scenario.duration_s, said="starting")
                 flown = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task, pair)
-                wire_hash, speed, lost = flown
-                records.append(
-                    runs.record(flight, folder=title, wire_hash=wire_hash, real_time_factor=speed, lost=lost)
-                )
+                records.append(runs.record(flight, folder=title, **flown))
                 runs.write_run(folder, runs.new_run("mavsitl " + " ".join(sys.argv[1:]), created, tuple(records)))
     except KeyboardInterrupt:
         console.print(f"interrupted; the logs so far are in {folder}")
@@ -669,8 +664,8 @@ def _fly(options: argparse.Namespace) -> int:
 
 def _fly_one(
     name: str, flight: Flight, settings: list[str], folder: Path, memory: bool, bar: RichProgress, task: Any, pair: Any
-) -> tuple[str, float, str]:
-    """One flight: the hash of its wire, how much faster than real time it went, and how the vehicle was lost."""
+) -> dict[str, Any]:
+    """One flight; what `run.record` wants to know of it."""
 
     def move(time_s: float) -> None:
         bar.update(task, completed=max(time_s, 0.0), said=f"{max(time_s, 0.0):5.1f} s")
@@ -688,14 +683,19 @@ def _fly_one(
         if not outcome.finished and not outcome.lost:
             raise pair.PairError(f"{flight.name}: the flight did not end as planned")
         wire_hash, speed, lost = outcome.wire_hash, outcome.speed, outcome.lost
+        dropped, links = outcome.dropped, outcome.links
     else:
         result = pair.fly(name, settings, folder, on_event)
-        wire_hash, speed, lost = result.vehicle["wire_hash"], result.vehicle["speed"], result.ground.get("lost", "")
+        said, lost = result.vehicle, result.ground.get("lost", "")
+        wire_hash, speed, dropped = said["wire_hash"], said["speed"], said["dropped"]
+        links = {"link": said["link"]} if "link" in said else {}
     if lost:
         bar.update(task, said="lost")
     else:
         bar.update(task, completed=flight.scenario.duration_s, said=f"{speed:.0f} x real time")
-    return wire_hash, speed, lost
+    return {
+        "wire_hash": wire_hash, "real_time_factor": speed, "lost": lost, "links": links, "dropped": dropped,
+    }  # fmt: skip
 
 
 def _show(console: Any, options: argparse.Namespace, folder: Path, records: list[FlightRecord]) -> int:
@@ -732,6 +732,8 @@ def _show(console: Any, options: argparse.Namespace, folder: Path, records: list
                 style = {"beaten": "green", "met": "green", "missed": "yellow"}.get(row.verdict or "", "")
                 table.add_row(row.state, tables.number(row.ours), paper, f"[{style}]{ratio}[/]" if style else ratio)
             console.print(table)
+            for link in tables.link_rows(record.links):
+                console.print(f"link {link}", soft_wrap=True, highlight=False)
     if not options.no_report:
         from mavsitl.report.html import write_report
 
@@ -1105,12 +1107,14 @@ def _replace(reply: Reply, **changes: Any) -> Reply:
 def _link(options: argparse.Namespace) -> int:
     from mavsitl import ends
     from mavsitl.ask import ParameterTask
-    from mavsitl.link.settings import PREFIXES
+    from mavsitl.link.settings import PREFIXES, initial
+    from mavsitl.scenario import LinkModel
 
     prefix = PREFIXES["gcs_link" if options.gcs else "link"]
     wanted: dict[str, float] = {}
     if options.reset:
-        wanted = {name: GOOD_MS if name == "GOOD" else 0.0 for name in LINK_OPTIONS.values()}
+        perfect = initial(LinkModel())
+        wanted = {name: perfect[name] for name in LINK_OPTIONS.values()}
     for option, name in LINK_OPTIONS.items():
         value = getattr(options, option)
         if value is not None:
@@ -1119,7 +1123,7 @@ def _link(options: argparse.Namespace) -> int:
     task = ParameterTask([(prefix + name, wanted.get(name)) for name in names])
     reply = _ask(options, task, ends.OFFBOARD_PORT if options.gcs else None)
     if not reply.ok and reply.vehicle is not None and wanted.get("DOWN"):
-        other = ends.GCS_PORT if options.gcs else ends.OFFBOARD_PORT
+        other = options.instance + (ends.OFFBOARD_PORT if options.gcs else ends.GCS_PORT)
         hint = f"an outage of the link that is spoken on has no answer; over --endpoint udpout:127.0.0.1:{other} it has"
         reply = _replace(reply, problem=f"{reply.problem} ({hint})")
 

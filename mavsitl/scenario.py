@@ -253,6 +253,7 @@ class LinkChange(Section, frozen=True):
     keep_order: bool | None = None
     loss: Fraction | None = None
     bursts: Bursts | None = None
+    """As a whole: what is left out of it is the default."""
     reorder: Fraction | None = None
     reorder_ms: Milliseconds | None = None
     duplicate: Fraction | None = None

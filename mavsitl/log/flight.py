@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -41,6 +41,24 @@ class LinkStatistics:
 
 
 @dataclass(frozen=True, eq=False)
+class ChannelLog:
+    """One direction of an impaired link, as logged once a second: k rows, of which each tells of the time before it."""
+
+    time_s: Array
+    """(k,) from the release."""
+    sent: Array
+    """(k,) messages since the row before; the three below are of these."""
+    lost: Array
+    """(k,) by chance, for the queue was full, or corrupted."""
+    outage: Array
+    """(k,)"""
+    delay_p50_ms: Array
+    """(k,) of those that came since the row before; NaN where none came."""
+    delay_p99_ms: Array
+    """(k,)"""
+
+
+@dataclass(frozen=True, eq=False)
 class FlightData:
     """k samples from the release on; world NWU, body FLU, Euler angles Z-Y-X as phi, theta, psi.
 
@@ -70,6 +88,8 @@ class FlightData:
     link: LinkStatistics | None
     saturated_share: float | None
     """Share of the samples with a rotor at its limit, 0 to 1."""
+    channels: Mapping[str, ChannelLog] = field(default_factory=dict)
+    """The off-board link's directions, "to_ground" and "to_vehicle", where it was impaired."""
 
     @classmethod
     def from_recorders(
@@ -133,6 +153,7 @@ class FlightData:
             demand=held(ground, topics.CONTROL_DEMAND, "u"),
             link=None if link is None else LinkStatistics(link[:, 0], link[:, 1], link[:, 2], link[:, 3] * 1e-3),
             saturated_share=None if saturated is None else _share(saturated[:, 0]),
+            channels=_channels(vehicle, release_us, int(stamps[-1])),
         )
 
     @property
@@ -178,6 +199,37 @@ def _held(tables: Tables, topic: Topic, stamps: npt.NDArray[Any], columns: tuple
 def _share(flags: Array) -> float | None:
     known = flags[~np.isnan(flags)]
     return float(np.mean(known != 0.0)) if known.size else None
+
+
+def _channels(vehicle: Tables, release_us: int, end_us: int) -> dict[str, ChannelLog]:
+    """From the first row after the release to the first at or after the end."""
+    found = {}
+    for direction, topic in topics.CHANNELS["link"].items():
+        table = vehicle.get(topic.key)
+        if table is None:
+            continue
+        stamps = table["timestamp"].astype(np.int64)
+        first, last = np.searchsorted(stamps, release_us, side="right"), np.searchsorted(stamps, end_us)
+        rows = slice(int(first), int(last) + 1)
+        came = _increments(table, rows, "delivered") > 0.0
+        found[direction] = ChannelLog(
+            time_s=(stamps[rows] - release_us).astype(np.float64) * 1e-6,
+            sent=_increments(table, rows, "sent"),
+            lost=sum((_increments(table, rows, name) for name in _NOT_TAKEN), start=np.zeros(came.size)),
+            outage=_increments(table, rows, "outage"),
+            delay_p50_ms=np.where(came, table["delay_p50_ms"][rows].astype(np.float64), np.nan),
+            delay_p99_ms=np.where(came, table["delay_p99_ms"][rows].astype(np.float64), np.nan),
+        )
+    return found
+
+
+_NOT_TAKEN = ("lost", "queue_drops", "corrupted")
+
+
+def _increments(table: Mapping[str, npt.NDArray[Any]], rows: slice, column: str) -> Array:
+    """By how much a count grew up to each row, from the row before it."""
+    grown: Array = np.diff(table[column].astype(np.float64), prepend=0.0)[rows]
+    return grown
 
 
 # The functions of `frames` are sign flips, so they take columns as well as numbers.

@@ -225,6 +225,35 @@ def link(flight: FlightData, colour: str, air: str) -> Drawing | None:
     return Drawing(_svg(draw, 2.3, "link", _HALF_WIDTH_IN), f"Link to the ground, {air}", "", half=True)
 
 
+def channels(flight: FlightData, air: str) -> Drawing | None:
+    """What an impaired link did, second by second, outages shaded by the share of messages that fell into them."""
+    if not flight.channels:
+        return None
+
+    def draw(figure: Figure) -> None:
+        top, bottom = _grid(figure, 2, 1, legend=True)[:, 0]
+        for (direction, log), colour in zip(flight.channels.items(), _TERMS, strict=False):
+            sent = np.maximum(log.sent, 1.0)
+            name = direction.replace("_", " ")
+            _line(top, log.time_s, 100.0 * log.lost / sent, colour, label=name)
+            _line(bottom, log.time_s, log.delay_p50_ms, colour)
+            _line(bottom, log.time_s, log.delay_p99_ms, colour, dashed=True)
+            starts_s = np.concatenate(([0.0], log.time_s[:-1]))
+            for start_s, end_s, share in zip(starts_s, log.time_s, log.outage / sent, strict=True):
+                if share > 0.0:
+                    for axes in (top, bottom):
+                        axes.axvspan(start_s, end_s, color=colour, alpha=0.25 * share, linewidth=0.0)
+        top.set_ylabel("lost / %")
+        bottom.set_ylabel("delay / ms")
+        for axes in (top, bottom):
+            axes.set_ylim(bottom=0.0)
+        _time_axis((top, bottom), flight.time_s)
+        _legend(figure, top)
+
+    caption = f"Off-board link: loss and delay (median, and dashed the 99th percentile) each second, {air}"
+    return Drawing(_svg(draw, 3.2, "channels"), caption, "")
+
+
 def _four(flight: FlightData, values: Array, colour: str, labels: list[str], *, share: bool, name: str) -> str:
     def draw(figure: Figure) -> None:
         grid = _grid(figure, 2, 2, share_y=share)

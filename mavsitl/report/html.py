@@ -51,6 +51,11 @@ class Shown:
         return (self.record.paper_case or "").partition("-")[0]
 
     @property
+    def links(self) -> list[tables.LinkRow]:
+        """Of the impaired links; empty where none was."""
+        return tables.link_rows(self.record.links)
+
+    @property
     def cut_short(self) -> bool:
         return bool(self.data.time_s[-1] < self.record.duration_s - 0.1)
 
@@ -177,4 +182,5 @@ def _drawings(group: list[Shown]) -> list[Drawing | None]:
     drawn += [figures.rotors(flight.data, flight.colour, flight.air) for flight in group]
     drawn += [figures.demand(flight.data, flight.colour, flight.air) for flight in group]
     drawn += [figures.link(flight.data, flight.colour, flight.air) for flight in group]
+    drawn += [figures.channels(flight.data, flight.air) for flight in group]
     return drawn

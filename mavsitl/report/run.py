@@ -42,6 +42,10 @@ class FlightRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Wind models; empty in calm air."""
     lost: str = ""
     """How the vehicle was lost in flight; empty: it was not."""
+    links: dict[str, dict[str, dict[str, float]]] = {}
+    """What the vehicle's impaired links did, by place and direction: `mavsitl.link.impaired.Statistics`."""
+    dropped: dict[str, int] = {}
+    """Input of the vehicle that was not taken, by reason: `mavsitl.codec.Counters`."""
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -57,7 +61,14 @@ def new_run(command: str, created_utc: str, flights: tuple[FlightRecord, ...]) -
 
 
 def record(
-    flight: Flight, *, folder: str, wire_hash: str, real_time_factor: float | None, lost: str = ""
+    flight: Flight,
+    *,
+    folder: str,
+    wire_hash: str,
+    real_time_factor: float | None,
+    lost: str = "",
+    links: dict[str, dict[str, dict[str, float]]] | None = None,
+    dropped: dict[str, int] | None = None,
 ) -> FlightRecord:
     """What `run.json` says of a flight."""
     scenario = flight.scenario
@@ -79,6 +90,8 @@ def record(
         paper_case=paper_case(scenario),
         wind=tuple(str(model.__struct_config__.tag) for model in scenario.wind),
         lost=lost,
+        links=links or {},
+        dropped=dropped or {},
     )
 
 

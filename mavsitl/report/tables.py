@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -32,6 +33,58 @@ def rows(ours: Rmse, paper_case: str | None) -> list[Row]:
         _row(f"{label} / {unit}", mine, paper)
         for label, unit, mine, paper in zip(LABELS, UNITS, ours.values(), theirs, strict=True)
     ]
+
+
+@dataclass(frozen=True)
+class LinkRow:
+    """One direction of an impaired link, over the whole flight; shares are of what was sent, 0 to 1."""
+
+    link: str
+    """E.g. ``off-board, to ground``."""
+    sent: int
+    delivered: int
+    lost: float
+    """By chance, for the queue was full, or corrupted."""
+    outage: float
+    duplicated: float
+    late: float
+    """Came after one that was sent later."""
+    delay_p50_ms: float
+    delay_p99_ms: float
+    delay_max_ms: float
+
+    def __str__(self) -> str:
+        text = f"{self.link}: {self.sent} sent, {100.0 * self.lost:.1f} % lost"
+        if self.outage:
+            text += f", {100.0 * self.outage:.1f} % in outages"
+        return f"{text}, delay {self.delay_p50_ms:.0f} ms (p99 {self.delay_p99_ms:.0f} ms)"
+
+
+LINKS = {"link": "off-board", "gcs_link": "ground stations", "tcp_link": "ground stations, TCP"}
+DIRECTIONS = {"to_ground": "to ground", "to_vehicle": "to vehicle"}
+
+
+def link_rows(links: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[LinkRow]:
+    """Of `FlightRecord.links`."""
+    rows = []
+    for place, directions in links.items():
+        for direction, counts in directions.items():
+            sent = max(counts["sent"], 1)
+            rows.append(
+                LinkRow(
+                    link=f"{LINKS.get(place, place)}, {DIRECTIONS.get(direction, direction)}",
+                    sent=int(counts["sent"]),
+                    delivered=int(counts["delivered"]),
+                    lost=(counts["lost"] + counts["queue_drops"] + counts["corrupted"]) / sent,
+                    outage=counts["outage"] / sent,
+                    duplicated=counts["duplicated"] / sent,
+                    late=counts["late"] / sent,
+                    delay_p50_ms=counts["delay_p50_ms"],
+                    delay_p99_ms=counts["delay_p99_ms"],
+                    delay_max_ms=counts["delay_max_ms"],
+                )
+            )
+    return rows
 
 
 def number(value: float) -> str:

@@ -36,7 +36,8 @@ WHOLE_S = 3.0
 MODE_S, ARM_S = 1.3, 1.5
 """Within that the HEARTBEAT has to show what was asked for."""
 MOST_MESSAGES_HZ = 150.0
-VOLATILE = ("COM_FLIGHT_UUID",)
+LINK_SETTINGS = ("BURST", "BW", "CORR", "DIR", "DOWN", "DUP", "GOOD", "JIT", "LAT", "LOSS", "REORD")
+VOLATILE = ("COM_FLIGHT_UUID", *(f"SIM_{link}_{name}" for link in ("LINK", "GLINK") for name in LINK_SETTINGS))
 """In the list and not in the hash."""
 
 LOITER, TAKEOFF, RTL, LAND = 3, 2, 5, 6

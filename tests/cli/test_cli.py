@@ -19,7 +19,7 @@ from mavsitl import __version__, cli, pair, scenario
 from mavsitl.cli import main
 from mavsitl.link.udp import LOOPBACK
 
-COMMANDS = ("fly", "vehicle", "ground", "check", "report", "scenarios")
+COMMANDS = ("fly", "vehicle", "ground", "check", "link", "inject", "param", "report", "scenarios")
 
 HELP = {
     "fly": ("--seed", "--airframe", "--law", "--level", "--wind-information", "--duration", "--set", "--run-dir",
@@ -31,6 +31,13 @@ HELP = {
                "udpin:127.0.0.1:14540", "mavsitl ground spiral-calm --link udpout:"),
     "check": ("--listen", "--for", "--quiet", "--all", "--json", "14550", "14540", "18570", "Exit codes",
               "udpout:HOST:PORT", "mavsitl check --listen tcp:127.0.0.1:5760"),
+    "link": ("--gcs", "--latency", "--jitter", "--loss", "--burst", "--good", "--reorder", "--duplicate", "--corrupt",
+             "--bandwidth", "--direction", "--down", "--up", "--reset", "--endpoint", "--instance", "--system",
+             "--timeout", "--json", "14580", "18570", "SIM_GLINK_", "Exit codes", "mavsitl link --gcs --reset"),
+    "inject": ("UNIT", "TYPE", "INSTANCE", "--list", "--endpoint", "--instance", "--system", "--timeout", "--json",
+               "SYS_FAILURE_EN", "Exit codes", "mavsitl inject motor off 2"),
+    "param": ("{get,set,list}", "NAME[=VALUE]", "--endpoint", "--instance", "--system", "--timeout", "--json",
+              "Exit codes", "mavsitl param set COM_OF_LOSS_T=0.5"),
     "report": ("RUN", "run.json", "report.html"),
     "scenarios": ("--json",),
 }  # fmt: skip
@@ -89,10 +96,16 @@ def test_examples_in_the_help_are_accepted_by_the_parser() -> None:
     parser = cli.build_parser()
     examples = re.findall(
         r"^  mavsitl (.+?)(?:  .*)?$",
-        cli.FLY_EXAMPLES + cli.VEHICLE_EXAMPLES + cli.GROUND_EXAMPLES + cli.CHECK_EXAMPLES,
+        cli.FLY_EXAMPLES
+        + cli.VEHICLE_EXAMPLES
+        + cli.GROUND_EXAMPLES
+        + cli.CHECK_EXAMPLES
+        + cli.LINK_EXAMPLES
+        + cli.INJECT_EXAMPLES
+        + cli.PARAM_EXAMPLES,
         re.M,
     )
-    assert len(examples) >= 16
+    assert len(examples) >= 30
     for example in examples:
         assert callable(parser.parse_args(example.split()).run), example
 

@@ -158,7 +158,9 @@ last column has gains for a slow link, about PX4's own (`MPC_XY_P`, `MPC_XY_VEL_
 - *50 to 130 ms*: uniform, each way; messages overtake one another.
 - *20 % reorder*: held back by 20 ms more.
 
-The mode is kept by any setpoint that comes within `COM_OF_LOSS_T`; whether the flight is any good is the gains' affair.
+A setpoint that comes within `COM_OF_LOSS_T` (1 s) keeps the mode, however old its news is; whether the flight is any
+good is the gains' affair. A burst can be longer than that: of those here one in 150 is. Then the vehicle's fail-safe
+acts (`COM_OBL_RC_ACT`), and the controller takes over again when the link is back.
 {failed}"""
 
 
