@@ -69,14 +69,14 @@ VEHICLE_HELP = """\
 A simulated PX4-like vehicle in real time. Like PX4 SITL it binds UDP 18570 and sends to 14550 (ground stations), binds
 14580 and sends to 14540 (off-board and companion computers), and speaks first. Whoever sends a valid MAVLink frame to
 either port is answered too. It binds loopback; --bind opens it to a network, where plain MAVLink has no authentication:
-everybody who can reach the port can fly the vehicle.
+everybody who can reach the port can fly the vehicle. So it needs signed messages there, or --insecure.
 """
 
 VEHICLE_EXAMPLES = """\
 examples:
   mavsitl vehicle                                    a vehicle on the ground, in calm air, on PX4's ports
   mavsitl vehicle hover-wind --instance 1            a second one: ports 18571, 14581, system id 2
-  mavsitl vehicle hover-wind --bind 0.0.0.0 --offboard-remote 192.0.2.7:14540
+  mavsitl vehicle hover-wind --bind 0.0.0.0 --insecure --offboard-remote 192.0.2.7:14540
 """
 
 GROUND_HELP = """\
@@ -160,6 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _exit_code(error: Exception) -> int | None:
     """Of an error whose text is for the user; None for any other. They are loaded here: most runs have none."""
+    from mavsitl.ends import ExposedError
     from mavsitl.link.address import AddressError
     from mavsitl.link.base import LinkError
     from mavsitl.log.errors import LogError
@@ -168,7 +169,7 @@ def _exit_code(error: Exception) -> int | None:
     from mavsitl.scenario import ScenarioError
     from mavsitl.wings import WingError
 
-    if isinstance(error, (UsageError, ScenarioError, AddressError, WingError)):
+    if isinstance(error, (UsageError, ExposedError, ScenarioError, AddressError, WingError)):
         return EXIT_USAGE
     return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RunError)) else None
 
@@ -283,6 +284,10 @@ def _add_vehicle(commands: Any) -> None:
     group.add_argument(
         "--bind", default="127.0.0.1", metavar="HOST", help="local address of all links (default: 127.0.0.1)"
     )
+    group.add_argument(
+        "--insecure", action="store_true",
+        help="with --bind: open to a network without signed messages, to everybody who can reach it",
+    )  # fmt: skip
     group.add_argument(
         "--offboard-port", type=_PORT, metavar="N", help="local port of the off-board link (default: 14580 + I)"
     )
@@ -658,8 +663,11 @@ def _vehicle(options: argparse.Namespace) -> int:
         gcs_port=options.gcs_port if options.gcs_port is not None else ends.GCS_PORT + instance,
         gcs_remote=_endpoint(options.gcs_remote or f"127.0.0.1:{ends.GCS_REMOTE_PORT}", "--gcs-remote"),
         tcp_port=options.tcp_port,
+        insecure=options.insecure,
     )
     _check_effect(options, "vehicle", ("--duration", "--wind-information"))
+    if options.insecure and ends.is_loopback(links.bind):
+        raise UsageError("--insecure: only with --bind and an address that is not loopback")
     _check_lockstep(
         options,
         real_time_only=(
@@ -677,6 +685,7 @@ def _vehicle(options: argparse.Namespace) -> int:
             wing=options.wing,
             deadline_s=options.deadline or DEADLINE_S,
             cpu=options.cpu,
+            report=status.say,
             progress=status.progress,
         )
     else:
@@ -688,7 +697,7 @@ def _vehicle(options: argparse.Namespace) -> int:
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
             until_finished=bool(options.until_disarmed), state=_state_folder(options, system_id),
-            stop=status.stop, progress=None,
+            report=status.say, stop=status.stop, progress=None,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK

@@ -111,6 +111,11 @@ class Node:
         """Queue another component's frame as it is, with its sequence number and signature."""
         self._outbox.append(frame)
 
+    @property
+    def waiting(self) -> int:
+        """Frames queued."""
+        return len(self._outbox)
+
     def datagrams(self, max_bytes: int = DATAGRAM_BYTES, combine: bool = False) -> list[bytes]:
         """Take the queued frames as datagrams, in order.
 

@@ -155,6 +155,11 @@ class Vehicle:
         return self.autopilot.token_us
 
     @property
+    def signed_only(self) -> bool:
+        """Every link obeys messages alone that carry a good signature."""
+        return self._signing is not None and self._signing.active(self._shared.trusted)
+
+    @property
     def weights(self) -> Array | None:
         """Output weights (3 outputs P I D, 3 axes, 1) of the PIDNN aboard; None where none is seated."""
         return None if self._seated is None else self._seated.weights
