@@ -78,6 +78,8 @@ class Attacker:
             "message": [stream.message_id for stream in telemetry.STREAMS],
         }
         self._sequence = 0
+        self._rest: list[bytes] = []
+        """Of a transaction that is under way."""
 
     # --- fields
 
@@ -176,10 +178,90 @@ class Attacker:
         """By a key that is nobody's."""
         return self._key.sign(self.frame(), self.random.randint(0, 255), self.random.getrandbits(47))
 
+    # --- transactions: by the protocol, so that what lies behind its first step is reached
+
+    def transaction(self) -> list[bytes]:
+        """The frames of one, in order, from one sender."""
+        made = self.random.choice((self._upload, self._file, self._log, self._values))()
+        sender = (67, self.random.randint(1, 3))
+        frames = []
+        for message in made:
+            self._sequence = (self._sequence + 1) & 0xFF
+            frames.append(encode(message, self._sequence, *sender))
+        return frames
+
+    def _with(self, name: str, **fields: Any) -> Any:
+        message = self.message(name)
+        kind = type(message)
+        values = {each: getattr(message, f"_{each}_raw", getattr(message, each)) for each in kind.fieldnames}
+        return kind(**(values | {"target_system": 1, "target_component": 1} | fields))
+
+    def _upload(self) -> list[Any]:
+        kind, count = self.random.choice((0, 0, 1, 2)), self.random.randint(1, 6)
+        name = self.random.choice(("MISSION_ITEM_INT", "MISSION_ITEM_INT", "MISSION_ITEM"))
+        frame = self.random.choice((2, 3, 6))
+        if self.random.random() < 0.5:  # nothing but what is flown
+            spots: dict[str, Any] = {
+                "x": 473977418,
+                "y": 85455939,
+                "z": 10.0,
+                "command": self.random.choice((16, 22, 21)),
+            }
+            spots |= {f"param{number}": 0.0 for number in range(1, 5)}
+            name, frame = "MISSION_ITEM_INT", 6
+        else:
+            spots = {}
+        return [
+            self._with("MISSION_COUNT", count=count, mission_type=kind),
+            *(self._with(name, seq=seq, frame=frame, mission_type=kind, current=0, **spots) for seq in range(count)),
+            self._with("MISSION_REQUEST_LIST", mission_type=kind),
+            *(self._with("MISSION_REQUEST_INT", seq=seq, mission_type=kind) for seq in range(count + 1)),
+            self._with("MISSION_ACK", type=0, mission_type=kind),
+        ]
+
+    def _file(self) -> list[Any]:
+        draw = self.random
+        path = draw.choice((b"/fs/microsd/x", b"/fs/microsd/d/z", draw.choice(PATHS)))[:200]
+        steps = [(9, b"/fs/microsd/d", 0), (draw.choice((6, 11)), path, 0)]
+        steps += [(7, draw.randbytes(200), draw.choice((0, 200, 2**31, 2**32 - 1))) for _ in range(3)]
+        steps += [
+            (1, b"", 0),
+            (4, path, 0),
+            (5, bytes(239), draw.choice((0, 100, 2**32 - 1))),
+            (15, b"", 0),
+            (1, b"", 0),
+        ]
+        steps += [(14, path, 0), (12, path, draw.choice((0, 5, 2**32 - 1))), (13, path + b"\0" + draw.choice(PATHS), 0)]
+        begin = draw.randint(0, 60000)
+        messages = []
+        for step, (opcode, data, offset) in enumerate(steps):
+            head = struct.pack("<HBBBBBxI", begin + step, 1, opcode, len(data[:239]), 0, 0, offset)
+            payload = list((head + data[:239]).ljust(PAYLOAD_BYTES, b"\0"))
+            messages.append(self._with("FILE_TRANSFER_PROTOCOL", target_network=0, payload=payload))
+        return messages
+
+    def _log(self) -> list[Any]:
+        draw = self.random
+        return [
+            self._with("LOG_REQUEST_LIST", start=0, end=65535),
+            *(
+                self._with("LOG_REQUEST_DATA", id=0, ofs=draw.choice((0, 90, 2**32 - 1)), count=self.whole("I"))
+                for _ in range(3)
+            ),
+            self._with("LOG_REQUEST_END"),
+        ]
+
+    def _values(self) -> list[Any]:
+        return [self._with("PARAM_SET", param_type=self.random.choice((6, 9))) for _ in range(5)]
+
     # --- datagrams
 
     def good(self) -> bytes:
         """One with at least one frame that is well formed, whatever its fields hold."""
+        if not self._rest and self.random.random() < 0.02:
+            self._rest = self.transaction()
+        if self._rest and self.random.random() < 0.5:
+            return self._rest.pop(0)
         kind = self.random.random()
         if kind < 0.80:
             return self.frame()

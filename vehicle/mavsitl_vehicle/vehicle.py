@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,9 @@ class Vehicle:
             Layer(flight.name, flight.scenario.parameters),
             Layer("system id", {"MAV_SYS_ID": system_id}),
         )
+        if state is not None:
+            with suppress(OSError):  # the stores say what is wrong
+                state.mkdir(mode=0o700, parents=True, exist_ok=True)  # the signing key will be in it
         parameter_store = keep_parameters(self.parameters, state, self._notes.append)
         self.parameters.put("MAV_SYS_ID", system_id)  # what was kept does not outweigh what was asked for
         plan_store = Store(state, "plan", PLAN_SCHEMA, self._notes.append)
