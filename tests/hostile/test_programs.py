@@ -8,9 +8,10 @@ import pytest
 
 from mavsitl.dialect import mavlink
 from tests.autopilot.conftest import Client
-from tests.hostile import fields, fuzz, loss, rivals
+from tests.hostile import fields, fuzz, guided, loss, rivals
 from tests.hostile.attacks import HANDLED
 from tests.hostile.report import Report
+from tests.hostile.targets import TARGETS
 
 
 def failures(report: Report) -> list[str]:
@@ -84,3 +85,25 @@ def test_a_quarter_of_the_frames_is_lost(seed: int) -> None:
     report = Report("")
     loss.measure(report, seed)
     assert failures(report) == []
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_guided(name: str) -> None:
+    assert failures(guided.guided([name], 150, 1, show=False)) == []
+
+
+def test_the_guide_knows_new_ground() -> None:
+    """New ground is told from old, and what a target raises is not swallowed."""
+    from mavsitl.services import statustext
+
+    def target(data: bytes) -> None:
+        text = data.decode("latin-1")
+        for message in statustext.chunks(1, text, 1 + len(data)):
+            assert message.chunk_seq < 2, "three chunks"
+
+    coverage = guided.Coverage()
+    assert coverage.run(target, b"a")
+    assert not coverage.run(target, b"b")
+    assert coverage.run(target, b"c" * 60)
+    with pytest.raises(AssertionError, match="three chunks"):
+        coverage.run(target, b"c" * 120)
