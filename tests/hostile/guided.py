@@ -138,8 +138,10 @@ def with_atheris(name: str, arguments: list[str]) -> None:
     import importlib
 
     atheris = importlib.import_module("atheris")
-    target = TARGETS[name]
-    atheris.instrument_all()
+    for loaded in [module for module in sys.modules if module.startswith(("mavsitl", "tests.hostile.targets"))]:
+        del sys.modules[loaded]  # it is instrumented as it is imported
+    with atheris.instrument_imports(include=["mavsitl", "mavsitl_vehicle"]):
+        target = importlib.import_module("tests.hostile.targets").TARGETS[name]
     atheris.Setup([name, f"-max_len={MAX_BYTES}", *arguments], target)
     atheris.Fuzz()
 
