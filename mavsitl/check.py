@@ -745,6 +745,6 @@ def _silence(ports: Sequence[PortReport], vehicle_ports: Sequence[VehiclePort]) 
         )
     yield _note(
         "A vehicle on another machine has to send to this one, and loopback does not hear it: there, "
-        "--bind 0.0.0.0 --gcs-remote THIS-MACHINE:14550; here, --listen udpin:0.0.0.0:14550. A firewall must let "
-        "UDP in."
+        "--bind 0.0.0.0 --gcs-remote THIS-MACHINE:14550, with a key or --insecure; here, --listen "
+        "udpin:0.0.0.0:14550. A firewall must let UDP in."
     )

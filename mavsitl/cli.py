@@ -76,14 +76,14 @@ VEHICLE_HELP = """\
 A simulated PX4-like vehicle in real time. Like PX4 SITL it binds UDP 18570 and sends to 14550 (ground stations), binds
 14580 and sends to 14540 (off-board and companion computers), and speaks first. Whoever sends a valid MAVLink frame to
 either port is answered too. It binds loopback; --bind opens it to a network, where plain MAVLink has no authentication:
-everybody who can reach the port can fly the vehicle.
+everybody who can reach the port can fly the vehicle. So it needs signed messages there, or --insecure.
 """
 
 VEHICLE_EXAMPLES = """\
 examples:
   mavsitl vehicle                                    a vehicle on the ground, in calm air, on PX4's ports
   mavsitl vehicle hover-wind --instance 1            a second one: ports 18571, 14581, system id 2
-  mavsitl vehicle hover-wind --bind 0.0.0.0 --offboard-remote 192.0.2.7:14540
+  mavsitl vehicle hover-wind --bind 0.0.0.0 --insecure --offboard-remote 192.0.2.7:14540
   mavsitl vehicle --chaos ack-first-lost --chaos ftp-drops:0.3@gcs
 """
 
@@ -257,6 +257,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _exit_code(error: Exception) -> int | None:
     """Of an error whose text is for the user; None for any other. They are loaded here: most runs have none."""
     from mavsitl.chaos.table import ChaosError
+    from mavsitl.ends import ExposedError
     from mavsitl.link.address import AddressError
     from mavsitl.link.base import LinkError
     from mavsitl.log.errors import LogError
@@ -265,7 +266,7 @@ def _exit_code(error: Exception) -> int | None:
     from mavsitl.scenario import ScenarioError
     from mavsitl.wings import WingError
 
-    if isinstance(error, (UsageError, ScenarioError, ChaosError, AddressError, WingError)):
+    if isinstance(error, (UsageError, ExposedError, ScenarioError, ChaosError, AddressError, WingError)):
         return EXIT_USAGE
     return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RunError)) else None
 
@@ -394,6 +395,10 @@ def _add_vehicle(commands: Any) -> None:
     group.add_argument(
         "--bind", default="127.0.0.1", metavar="HOST", help="local address of all links (default: 127.0.0.1)"
     )
+    group.add_argument(
+        "--insecure", action="store_true",
+        help="with --bind: open to a network without signed messages, to everybody who can reach it",
+    )  # fmt: skip
     group.add_argument(
         "--offboard-port", type=_PORT, metavar="N", help="local port of the off-board link (default: 14580 + I)"
     )
@@ -894,8 +899,11 @@ def _vehicle(options: argparse.Namespace) -> int:
         gcs_port=options.gcs_port if options.gcs_port is not None else ends.GCS_PORT + instance,
         gcs_remote=_endpoint(options.gcs_remote or f"127.0.0.1:{ends.GCS_REMOTE_PORT}", "--gcs-remote"),
         tcp_port=options.tcp_port,
+        insecure=options.insecure,
     )
     _check_effect(options, "vehicle", ("--duration", "--wind-information"))
+    if options.insecure and ends.is_loopback(links.bind):
+        raise UsageError("--insecure: only with --bind and an address that is not loopback")
     _check_lockstep(
         options,
         real_time_only=(
@@ -914,6 +922,7 @@ def _vehicle(options: argparse.Namespace) -> int:
             wing=options.wing,
             deadline_s=options.deadline or DEADLINE_S,
             cpu=options.cpu,
+            report=status.say,
             progress=status.progress,
         )
     else:
@@ -927,7 +936,7 @@ def _vehicle(options: argparse.Namespace) -> int:
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
             until_finished=bool(options.until_disarmed), state=_state_folder(options, system_id),
-            stop=status.stop, progress=None, report=status.say,
+            report=status.say, stop=status.stop, progress=None,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK

@@ -122,7 +122,8 @@ class Counters:
     errors: int = 0
     """good frames whose handler failed, which is a bug of ours; counted as `unsupported` is"""
     over_budget: int = 0
-    """datagrams dropped unread because their source had used up its input budget; counted by whoever reads them"""
+    """datagrams dropped unread because their source had used up its input budget, and commands not done because their
+    sender had; counted by whoever reads them"""
     crowded: int = 0
     """the same, for the budget of all sources together that are no peers"""
 

@@ -251,6 +251,42 @@ class VehicleLinks:
     gcs_remote: tuple[str, int] = (LOOPBACK, GCS_REMOTE_PORT)
     tcp_port: int | None = None
     """Of a TCP server for ground stations; None: none."""
+    insecure: bool = False
+    """Whoever reaches `bind`, another address than loopback, may fly the vehicle without a key."""
+
+    def sockets(self, *, lockstep: bool) -> str:
+        """What is bound, for a person."""
+        host = f"[{self.bind}]" if ":" in self.bind else self.bind
+        bound = [f"UDP {host}:{self.offboard_port} (off-board)"]
+        if not lockstep:
+            bound.append(f"UDP {host}:{self.gcs_port} (ground stations)")
+            if self.tcp_port is not None:
+                bound.append(f"TCP {host}:{self.tcp_port} (ground stations)")
+        return ", ".join(bound)
+
+
+class ExposedError(Exception):
+    """A vehicle would be open to a network without a key, and nobody said that it may. The text names the ways out."""
+
+
+def _check_exposed(links: VehicleLinks, report: Callable[[str], None], *, signed: bool, lockstep: bool) -> None:
+    """Of an address that is not loopback: say what it exposes. Raises `ExposedError` where that is not allowed."""
+    if is_loopback(links.bind):
+        return
+    sockets = links.sockets(lockstep=lockstep)
+    if signed:
+        report(f"open to the network: {sockets}; only messages signed with the vehicle's key are obeyed")
+    elif links.insecure:
+        report(f"open to the network WITHOUT AUTHENTICATION: {sockets}; whoever reaches them can fly the vehicle")
+    else:
+        key = "" if lockstep else (
+            "let it demand signed messages (start it on loopback, give it a key by SETUP_SIGNING and set "
+            "MAV_SIGN_CFG to 1 or 2, and start it again with the same --state-dir), or "
+        )  # fmt: skip
+        raise ExposedError(
+            f"--bind {links.bind} opens {sockets} to a network, and whoever reaches them could fly the vehicle: "
+            f"{key}say --insecure"
+        )
 
 
 def vehicle_lockstep(
@@ -262,9 +298,14 @@ def vehicle_lockstep(
     wing: str | None,
     deadline_s: float,
     cpu: int | None,
+    report: Callable[[str], None],
     progress: Progress | None,
 ) -> Outcome:
-    """The vehicle in lock-step over UDP with one ground. Raises `LinkError`, `ScenarioError`, `LogError`."""
+    """The vehicle in lock-step over UDP with one ground.
+
+    Raises `LinkError`, `ScenarioError`, `LogError`, `ExposedError`.
+    """
+    _check_exposed(links, report, signed=False, lockstep=True)
     link = ConnectedUdp(
         links.offboard_remote, (links.bind, links.offboard_port), timeout_s=drivers.FIRST_REPEAT_S,
         port_option="--offboard-port N", host_option="--bind HOST",
@@ -317,7 +358,7 @@ def ground_lockstep(
 def vehicle_realtime(
     flight: Flight, links: VehicleLinks, folder: Path | None, *,
     system_id: int, wing: str | None, speed: float, until_finished: bool, state: Path | None,
-    stop: Callable[[], bool], progress: Progress | None, report: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
 ) -> Outcome:  # fmt: skip
     """The vehicle on the wall clock, with PX4 SITL's two links and TCP where asked for. Raises as `vehicle_lockstep`.
 
@@ -369,6 +410,11 @@ def vehicle_realtime(
             if herald.sequence:
                 core.continue_from(herald.sequence)
             watch = _Watch(core)
+            try:
+                _check_exposed(links, report, signed=core.signed_only, lockstep=False)
+            except ExposedError:
+                core.close()
+                raise
             timing = drivers.run_realtime_vehicle(
                 core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, say=report,
                 progress=progress, due_s=live.due_s,

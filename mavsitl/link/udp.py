@@ -23,6 +23,9 @@ PEER_SILENCE_US = 10_000_000
 NEWCOMER_BYTES = 16_384
 """A new peer is sent no more than this until it speaks again: one forged datagram brings its victim no more."""
 
+_SYSTEM_BUFFER_BYTES = 4 << 20
+"""Asked for; the system gives what it allows. A flood that comes while the process sleeps pushes nobody else out."""
+
 _READ_BYTES = MAX_DATAGRAM_BYTES + 1  # one more than the parser takes: a cut datagram is still seen to be too long
 
 
@@ -71,6 +74,7 @@ class UdpLink:
         self.remote: Source | None = None if remote is None else resolve(*remote, family)[1]
         self._socket = bind_socket(bind, family, socket.SOCK_DGRAM, port_option, host_option)
         self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SYSTEM_BUFFER_BYTES)
         self.address: Source = self._socket.getsockname()
         self.refused = 0
         self.send_errors = 0

@@ -33,6 +33,10 @@ class TokenBucket:
         self._credit -= tokens * 1e6
         return True
 
+    def spend(self, tokens: float) -> None:
+        """Take tokens that need not be there: what is owed is paid back before the next is given."""
+        self._credit -= tokens * 1e6
+
 
 class FairBuckets:
     """A `TokenBucket` for each sender, so that one that asks too much is refused and the others are not.
@@ -61,3 +65,10 @@ class FairBuckets:
             bucket = self._buckets[sender] = TokenBucket(self._rate_hz, self._burst)
         self._buckets.move_to_end(sender)
         return bucket.take(now_us) and self._all.take(now_us)
+
+    def spend(self, sender: Peer, tokens: float) -> None:
+        """Of the sender who took last: what it asked for came to more than it took."""
+        bucket = self._buckets.get(sender)
+        if bucket is not None:
+            bucket.spend(tokens)
+        self._all.spend(tokens)

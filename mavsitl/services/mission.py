@@ -15,7 +15,7 @@ import struct
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isinf, isnan, nan
+from math import isnan, nan
 from typing import Any, NamedTuple
 from zlib import crc32
 
@@ -63,6 +63,9 @@ DEFAULT_LIMITS: Mapping[int, int] = {MISSION: 2000, FENCE: 64, RALLY: 32}
 
 NOWHERE = 2**31 - 1
 """An integer coordinate that says nothing, as NaN does in a float: MAVLink's convention for COMMAND_INT and items."""
+
+LARGEST = 1e10
+"""No parameter of an item means anything beyond; infinities are."""
 
 REQUEST_RETRY_US = 250_000
 """PX4's `MAVLINK_MISSION_RETRY_TIMEOUT_DEFAULT`."""
@@ -240,15 +243,15 @@ def item_message(
 
 
 def check_item(mission_type: int, item: MissionItem) -> int:
-    """What holds for every vehicle, as a MAV_MISSION_RESULT: finite numbers, coordinates on Earth, items in their plan.
+    """What holds for every vehicle, as a MAV_MISSION_RESULT: usable numbers, coordinates on Earth, items in their plan.
 
     A command with a position may leave it open here (NaN, `NOWHERE`) in a mission, since some mean "here" by that;
     a fence or rally point may not.
     """
     for offset, value in enumerate((item.param1, item.param2, item.param3, item.param4)):
-        if isinf(value):
+        if abs(value) > LARGEST:
             return INVALID_PARAM1 + offset
-    if isinf(item.z):
+    if abs(item.z) > LARGEST:
         return INVALID_PARAM7
     is_fence, is_rally = item.command in _FENCE_COMMANDS, item.command in _RALLY_COMMANDS
     if mission_type == MISSION:

@@ -145,7 +145,7 @@ def test_arming_and_disarming_on_the_ground(client: Client) -> None:
     assert client.texts()[-1] == "Disarmed by command"
 
 
-@pytest.mark.parametrize("wanted", [2.0, -1.0, 0.5, nan, 3e38])
+@pytest.mark.parametrize("wanted", [2.0, -1.0, 0.5, nan, 1e10])
 def test_arm_needs_nought_or_one(client: Client, wanted: float) -> None:
     assert client.result(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, wanted) == DENIED
     client.tick()

@@ -110,7 +110,7 @@ def test_quaternion_norm(norm: float, good: bool) -> None:
     assert isinstance(unused, RateSetpoint)
 
 
-@pytest.mark.parametrize(("sent", "flown"), [(-3.0e38, 0.0), (-0.1, 0.0), (0.3, 0.3), (1.0, 1.0), (1.5, 1.0)])
+@pytest.mark.parametrize(("sent", "flown"), [(-3.0e7, 0.0), (-0.1, 0.0), (0.3, 0.3), (1.0, 1.0), (1.5, 1.0)])
 @pytest.mark.parametrize("type_mask", [7, 128])
 def test_thrust_is_clipped(type_mask: int, sent: float, flown: float) -> None:
     taken = from_attitude_target(attitude_target(type_mask, thrust=sent))
@@ -223,7 +223,7 @@ def test_the_whole_reason_arrives(client: Client) -> None:
 
 def test_a_bad_stream_does_not_flood_its_link(client: Client) -> None:
     client.run(2.9, lambda: client.send(attitude_target(7, thrust=nan)))
-    reason = "SET_ATTITUDE_TARGET refused: thrust is not finite"
+    reason = "SET_ATTITUDE_TARGET refused: thrust is nan"
     assert client.texts() == [reason, reason, f"{reason} (498 more held back)"]
     assert client.vehicle.autopilot.refused_setpoints == 725
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mavsitl_vehicle.vehicle import Vehicle
 
-from mavsitl.codec import encode, parse
+from mavsitl.codec import Frame, encode, parse
 from mavsitl.dialect import mavlink
 from mavsitl.keep import carry_out
 from mavsitl.log.ulog import MemoryRecorder
@@ -129,3 +129,69 @@ def test_the_key_is_in_no_parameter_log_or_file_that_is_served(tmp_path: Path) -
         assert secret not in data
         assert secret.hex().encode() not in data
     assert secret.hex() not in repr(ground.vehicle.__dict__)
+
+
+def test_no_replay_after_a_kill_and_who_hears_the_vehicle_is_let_in(tmp_path: Path) -> None:
+    """Killed, not closed: what was heard before is old afterwards, and so is what was signed meanwhile."""
+    ground = Signer(tmp_path)
+    ground.set_up()
+    assert ground.vehicle.parameters.set("MAV_SIGN_CFG", ALWAYS) is None
+    ground.run(2.0)
+    message = mavlink.MAVLink_command_long_message(1, 1, mavlink.MAV_CMD_GET_HOME_POSITION, 0, *[0.0] * 7)
+    recorded = [KEY.sign(encode(message, n, *GROUND), link, ground.stamp + n) for n, link in enumerate((1, 1, 2))]
+    assert [ground.vehicle.receive(0, frame) for frame in recorded[:2]] == [1, 1]
+    ground.run(0.3)
+
+    again = Signer(tmp_path, begin_us=ground.clock_us - START_UNIX_US + 100_000)
+    assert [again.vehicle.receive(0, frame) for frame in recorded] == [0, 0, 0]
+    assert again.command(signed=True) == 0  # its clock has not heard of ours
+    assert again.all_signed()
+    heard = max(int.from_bytes(frame.message.get_msgbuf()[-12:-6], "little") for frame in again.frames)
+    frame = KEY.sign(encode(message, 3, *GROUND), 1, max(heard, again.stamp) + 1)
+    assert again.vehicle.receive(0, frame) == 1
+    assert again.vehicle.receive(0, frame) == 0
+
+
+def test_a_killed_vehicle_does_not_sign_a_stamp_twice(tmp_path: Path) -> None:
+    ground = Signer(tmp_path)
+    ground.set_up()
+    assert ground.vehicle.parameters.set("MAV_SIGN_CFG", ALWAYS) is None
+    ground.run(2.0)
+    last = max(int.from_bytes(f.message.get_msgbuf()[-12:-6], "little") for f in ground.frames or _some(ground))
+    again = Signer(tmp_path, begin_us=0)  # the system's clock was set back, too
+    first = min(int.from_bytes(f.message.get_msgbuf()[-12:-6], "little") for f in again.frames or _some(again))
+    assert first > last
+
+
+def _some(ground: Signer) -> list[Frame]:
+    assert ground.all_signed()
+    return ground.frames
+
+
+def test_the_key_s_file_is_its_owner_s_and_so_is_a_folder_made_for_it(tmp_path: Path) -> None:
+    state = tmp_path / "deep" / "state"
+    ground = Signer(state)
+    ground.set_up()
+    ground.run(1.5)
+    assert stat.S_IMODE((state / "signing.json").stat().st_mode) == 0o600
+    assert stat.S_IMODE(state.stat().st_mode) == 0o700
+    ground.vehicle.close()
+
+
+def test_a_flood_of_forged_frames_locks_nobody_out_and_fills_no_table(tmp_path: Path) -> None:
+    ground = Signer(tmp_path)
+    ground.set_up()
+    assert ground.vehicle.parameters.set("MAV_SIGN_CFG", ALWAYS) is None
+    ground.run(1.5)
+    forger = Key(bytes(range(1, 33)))
+    message = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
+    believed = 0
+    for number in range(3000):
+        sender = GROUND if number % 2 else (1 + number % 250, number % 256)
+        forged = forger.sign(encode(message, number & 0xFF, *sender), number & 0xFF, 2**48 - 16)
+        believed += ground.vehicle.receive(0, forged)
+    assert believed == 0
+    signing = ground.vehicle._signing
+    assert signing is not None
+    assert signing.streams <= 1
+    assert ground.command(signed=True) == 1

@@ -123,7 +123,7 @@ def test_a_vehicle_in_real_time_is_heard_before_it_is_built(monkeypatch: pytest.
         with pytest.raises(LinkError, match="enough"):
             ends.vehicle_realtime(
                 shortened("hover-calm", 1.0), links, None, system_id=1, wing=None, speed=1.0, until_finished=False,
-                state=None, stop=lambda: True, progress=None,
+                state=None, report=lambda text: None, stop=lambda: True, progress=None,
             )  # fmt: skip
     finally:
         for receiver in receivers:

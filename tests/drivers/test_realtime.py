@@ -218,7 +218,8 @@ def test_vehicle_and_ground_meet_on_real_sockets() -> None:
         vehicle = pool.submit(
             ends.vehicle_realtime,
             flight, links, None,
-            system_id=1, wing=None, speed=2.0, until_finished=False, state=None, stop=stop, progress=None,
+            system_id=1, wing=None, speed=2.0, until_finished=False, state=None,
+            report=lambda text: None, stop=stop, progress=None,
         )  # fmt: skip
         vehicle.add_done_callback(lambda end: give_up.set())  # an end that raises ends the other, and is seen below
         try:

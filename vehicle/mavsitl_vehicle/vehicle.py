@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +82,9 @@ class Vehicle:
             Layer(flight.name, flight.scenario.parameters),
             Layer("system id", {"MAV_SYS_ID": system_id}),
         )
+        if state is not None:
+            with suppress(OSError):  # the stores say what is wrong
+                state.mkdir(mode=0o700, parents=True, exist_ok=True)  # the signing key will be in it
         parameter_store = keep_parameters(self.parameters, state, self.warn)
         self.parameters.put("MAV_SYS_ID", system_id)  # what was kept does not outweigh what was asked for
         plan_store = Store(state, "plan", PLAN_SCHEMA, self.warn)
@@ -239,6 +243,11 @@ class Vehicle:
     def token_us(self) -> int:
         """The stamp that the newest off-board setpoint echoes; lock-step advances when it is the tick's own."""
         return self.autopilot.token_us
+
+    @property
+    def signed_only(self) -> bool:
+        """Every link obeys messages alone that carry a good signature."""
+        return self._signing is not None and self._signing.active(self._shared.trusted)
 
     @property
     def weights(self) -> Array | None:

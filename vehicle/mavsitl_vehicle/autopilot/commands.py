@@ -41,6 +41,9 @@ RELATIVE_FRAMES = (
 UNKNOWN_INT = 2**31 - 1
 """COMMAND_INT's NaN in x and y."""
 
+LARGEST = 1e10
+"""No parameter of a command means anything beyond; infinities are. Integer coordinates are below."""
+
 MIN_TAKEOFF_M, MAX_TAKEOFF_M = 0.3, 200.0
 """Of a take-off altitude that is below ours above the sea, and so meant relative to the ground."""
 BELOW_MARGIN_M = 1.0
@@ -75,6 +78,9 @@ def execute(autopilot: Autopilot, command: Command, now_us: int, port: Port) -> 
     if row is None:
         autopilot.warn("unsupported", f"Command {command.id} is not supported")
         return UNSUPPORTED
+    for number, value in enumerate(command.params, 1):
+        if abs(value) > LARGEST:  # NaN is not: it asks for the default
+            return _deny(autopilot, f"Command {command.id} refused: param{number} is {value:g}")
     return row.handler(autopilot, command, now_us, port)
 
 

@@ -10,7 +10,7 @@ from mavsitl.codec import Message
 from mavsitl.dialect import mavlink
 from mavsitl.node import Node
 from mavsitl.services.base import Peer, Service
-from mavsitl.services.bucket import TokenBucket
+from mavsitl.services.bucket import FairBuckets, TokenBucket
 from mavsitl.services.command import Command, CommandServer
 from mavsitl.services.files import FileTree, Folder, MemoryFiles, Mounts
 from mavsitl.services.ftp import FtpServer
@@ -30,6 +30,9 @@ COMPONENT_ID = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 FORWARDED_HZ, FORWARDED_BURST = 2000.0, 200.0
 """Frames of others passed on to a link, at most."""
+
+COMMANDS_HZ, COMMANDS_BURST = 200.0, 200.0
+"""Frames a second that answer the commands of one sender; what is beyond is not done, and its sender asks again."""
 
 BUSY_US = 10_000_000
 """After a client's last word the services are stepped in every period for so long, and then every `IDLE_STEP_US`."""
@@ -108,6 +111,7 @@ class Port:
         """What telemetry speaks of."""
         self._autopilot = autopilot
         self._commands = CommandServer(self._execute)
+        self._commanded = FairBuckets(COMMANDS_HZ, COMMANDS_BURST)
         self._busy_until_us = 0
         self._step_us = 0
         self._forwarded = TokenBucket(FORWARDED_HZ, FORWARDED_BURST)
@@ -143,8 +147,13 @@ class Port:
         """
         kind = type(message).id
         if kind in (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT):
+            if not self._commanded.take(sender, now_us):
+                self.node.counters.over_budget += 1
+                return True
+            waiting = self.node.queued
             command, result = self._commands.receive(message, *sender, now_us)
             self.node.send(telemetry.COMMAND_ACK, command, result, 0, 0, *sender)
+            self._commanded.spend(sender, self.node.queued - waiting - 1)
             return True
         service = self._services.get(kind)
         if service is None:

@@ -32,6 +32,9 @@ ABOVE_HOME = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_FRAME_GLOBAL_REL
 ABOVE_GROUND = mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT, mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT
 """What `alt` of SET_POSITION_TARGET_GLOBAL_INT counts from, by frame."""
 
+LARGEST = 3e7
+"""No place on Earth is so many metres away, and no speed, acceleration, angle or rate means anything beyond."""
+
 NORM_TOLERANCE = 0.01
 """How far a setpoint's quaternion may be from unit length; float32 and honest clients stay within 1e-6."""
 
@@ -121,8 +124,8 @@ def from_attitude_target(message: Any) -> Setpoint | Refusal:
     The attitude is used unless ATTITUDE_IGNORE is set, and then a body yaw rate that is not ignored feeds its yaw
     forward. Otherwise body rates are used if neither roll nor pitch rate is ignored. THROTTLE_IGNORE means zero thrust;
     THRUST_BODY_SET takes thrust_body's upward share (-z) for the collective and leaves its x and y.
-    Fields that the mask leaves out are not looked at; a used field that is not finite, or a quaternion that is not of
-    unit length, refuses the whole message.
+    Fields that the mask leaves out are not looked at; a used field that is not finite or beyond `LARGEST`, or a
+    quaternion that is not of unit length, refuses the whole message.
     """
     mask: int = message.type_mask
     thrust_body = getattr(message, "thrust_body", None) if mask & THRUST_BODY_SET else None
@@ -137,10 +140,10 @@ def from_attitude_target(message: Any) -> Setpoint | Refusal:
     else:
         thrust = message.thrust if thrust_body is None else -thrust_body[2]
     yaw_rate = nan if mask & YAW_RATE_IGNORE else message.body_yaw_rate
-    if not isfinite(thrust):
-        return Refusal("SET_ATTITUDE_TARGET refused: thrust is not finite")
-    if not mask & YAW_RATE_IGNORE and not isfinite(yaw_rate):
-        return Refusal("SET_ATTITUDE_TARGET refused: body_yaw_rate is not finite")
+    if not _usable(thrust):
+        return Refusal(f"SET_ATTITUDE_TARGET refused: thrust is {thrust:g}")
+    if not mask & YAW_RATE_IGNORE and not _usable(yaw_rate):
+        return Refusal(f"SET_ATTITUDE_TARGET refused: body_yaw_rate is {yaw_rate:g}")
     thrust = min(max(thrust, 0.0), 1.0)
     if use_attitude:
         w, x, y, z = message.q
@@ -150,8 +153,8 @@ def from_attitude_target(message: Any) -> Setpoint | Refusal:
         attitude = flip_quaternion(w / norm, x / norm, y / norm, z / norm)
         return AttitudeSetpoint(attitude, -yaw_rate, thrust)
     p, q = message.body_roll_rate, message.body_pitch_rate
-    if not (isfinite(p) and isfinite(q)):
-        return Refusal("SET_ATTITUDE_TARGET refused: body rates are not finite")
+    if not _usable(p, q):
+        return Refusal(f"SET_ATTITUDE_TARGET refused: body rates are {p:g}, {q:g}")
     return RateSetpoint(flip_vector(p, q, yaw_rate), thrust)
 
 
@@ -160,8 +163,8 @@ def from_actuator_control_target(message: Any) -> Setpoint | Refusal:
     if message.group_mlx != 0:
         return Refusal(f"SET_ACTUATOR_CONTROL_TARGET refused: group {message.group_mlx}, only group 0 is flown")
     roll, pitch, yaw, thrust = message.controls[:4]
-    if not (isfinite(roll) and isfinite(pitch) and isfinite(yaw) and isfinite(thrust)):
-        return Refusal("SET_ACTUATOR_CONTROL_TARGET refused: controls are not finite")
+    if not _usable(roll, pitch, yaw, thrust):
+        return Refusal(f"SET_ACTUATOR_CONTROL_TARGET refused: controls are {roll:g}, {pitch:g}, {yaw:g}, {thrust:g}")
     roll, pitch, yaw = (min(max(value, -1.0), 1.0) for value in (roll, pitch, yaw))
     return TorqueSetpoint(flip_vector(roll, pitch, yaw), min(max(thrust, 0.0), 1.0))
 
@@ -175,8 +178,8 @@ def from_position_target_local_ned(message: Any, state: State) -> PositionSetpoi
 
     In the turned frames an axis exists only together with the others that it is turned into: of x and y, one that is
     ignored beside a used one is 0, and BODY_NED takes an acceleration only whole. Refused: other frames, a mask that
-    leaves nothing to hold, FORCE with an acceleration, used fields that are not finite, and an unknown state where the
-    frame needs it.
+    leaves nothing to hold, FORCE with an acceleration, used fields that are not finite or beyond `LARGEST`, and an
+    unknown state where the frame needs it.
     """
     name = "SET_POSITION_TARGET_LOCAL_NED"
     mask: int = message.type_mask
@@ -253,6 +256,10 @@ def from_position_target_global_int(
     return _checked(name, message, mask, (north, -west, -up), velocity, acceleration)
 
 
+def _usable(*values: float) -> bool:
+    return all(abs(value) <= LARGEST for value in values)
+
+
 def _used(mask: int, bits: tuple[int, int, int], x: float, y: float, z: float) -> Vector:
     return nan if mask & bits[0] else x, nan if mask & bits[1] else y, nan if mask & bits[2] else z
 
@@ -269,20 +276,21 @@ def _checked(
     ):
         if values is FREE or all(mask & bit for bit in bits):
             groups.append(FREE)
-        elif all(mask & bit or isfinite(value) for bit, value in zip(bits, values, strict=True)):
+        elif all(mask & bit or _usable(value) for bit, value in zip(bits, values, strict=True)):
             groups.append(flip_vector(*values))
         else:
-            return Refusal(f"{name} refused: {label} is not finite")
+            x, y, z = values
+            return Refusal(f"{name} refused: {label} is {x:g}, {y:g}, {z:g}")
     if all(group is FREE for group in groups):
         return Refusal(f"{name} refused: type_mask {mask:#05x} leaves no position, velocity or acceleration")
     if mask & FORCE_SET and groups[2] is not FREE:
         return Refusal(f"{name} refused: FORCE is not supported")
     yaw = nan if mask & YAW_IGNORE else -message.yaw
     yaw_rate = nan if mask & TARGET_YAW_RATE_IGNORE else -message.yaw_rate
-    if not (mask & YAW_IGNORE or isfinite(yaw)):
-        return Refusal(f"{name} refused: yaw is not finite")
-    if not (mask & TARGET_YAW_RATE_IGNORE or isfinite(yaw_rate)):
-        return Refusal(f"{name} refused: yaw_rate is not finite")
+    if not (mask & YAW_IGNORE or _usable(yaw)):
+        return Refusal(f"{name} refused: yaw is {yaw:g}")
+    if not (mask & TARGET_YAW_RATE_IGNORE or _usable(yaw_rate)):
+        return Refusal(f"{name} refused: yaw_rate is {yaw_rate:g}")
     return PositionSetpoint(groups[0], groups[1], groups[2], remainder(yaw, 2.0 * pi), yaw_rate)
 
 

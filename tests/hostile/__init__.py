@@ -1,0 +1,1 @@
+"""What strangers may send, and what the vehicle makes of it: each program prints demand and figure."""
