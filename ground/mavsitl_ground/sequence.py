@@ -22,7 +22,7 @@ STREAM_TIME_US = 500_000
 RETRY_US = 1_000_000
 """After a refusal."""
 DISARMED_TIME_US = 500_000
-"""A vehicle disarmed in flight for so long was disarmed by somebody; a restarted one shows its clock before."""
+"""A vehicle disarmed in flight for so long was disarmed by somebody: one that restarted says so before."""
 STOP_TIME_US = 120_000_000
 """Longest wait for the vehicle to land and disarm."""
 FORCE_DISARM = 21196.0
@@ -77,6 +77,7 @@ class Handshake:
         self._retry_us = 0
         self._heard_us = -1
         self._disarmed_us: int | None = None
+        self._boots = False
         self.phase = Phase.SEARCH
         self.target: tuple[int, int] | None = None
         self.armed = False
@@ -97,6 +98,10 @@ class Handshake:
             message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
         )
         if not is_autopilot or self._wanted_system not in (None, system_id):
+            return
+        if message.system_status == mavlink.MAV_STATE_BOOT:
+            # Its last run is over, and it answers nothing yet.
+            self._boots = self._boots or self.target == (system_id, component_id)
             return
         if self.target is None:
             self.target = (system_id, component_id)
@@ -131,7 +136,10 @@ class Handshake:
         self._enter(Phase.STOP, now_us)
 
     def step(self, now_us: int) -> None:
-        if self.target is not None and now_us - self._heard_us > SILENCE_TIMEOUT_US:
+        if self._boots:
+            self._boots = False
+            self.lose("it boots", now_us)
+        elif self.target is not None and now_us - self._heard_us > SILENCE_TIMEOUT_US:
             self.lose(f"silent for {SILENCE_TIMEOUT_US / 1e6:g} s", now_us)
         _STEPS[self.phase](self, now_us)
         self._client.step(now_us)
