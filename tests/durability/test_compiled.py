@@ -23,8 +23,7 @@ client.offboard()
 client.run(1.0, client.attitude)
 assert client.vehicle.autopilot.wind is not None
 client.land()
-client.run(6.0)
-assert not client.armed
+client.run_until(lambda: not client.armed, 30.0)
 print(len(before), sorted(compiled() - before))
 """
 
