@@ -33,5 +33,5 @@ def test_no_kernel_meets_its_first_call_in_flight() -> None:
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
     number, _, late = done.stdout.strip().partition(" ")
     assert done.returncode == 0, done.stderr
-    assert int(number) > 5
+    assert int(number) > 0
     assert late == "[]"
