@@ -81,6 +81,7 @@ class Handshake:
         self._retry_us = 0
         self._heard_us = -1
         self._disarmed_us: int | None = None
+        self._boots = False
         self.phase = Phase.SEARCH
         self.lost = ""
         """How the vehicle was lost in flight; empty: it was not."""
@@ -105,6 +106,10 @@ class Handshake:
             message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
         )
         if not is_autopilot or self._wanted_system not in (None, system_id):
+            return
+        if message.system_status == mavlink.MAV_STATE_BOOT:
+            # Its last run is over, and it answers nothing yet.
+            self._boots = self._boots or self.target == (system_id, component_id)
             return
         if self.target is None:
             self.target = (system_id, component_id)
@@ -148,7 +153,10 @@ class Handshake:
         self._enter(Phase.STOP, now_us)
 
     def step(self, now_us: int) -> None:
-        if self.target is not None and now_us - self._heard_us > SILENCE_TIMEOUT_US:
+        if self._boots:
+            self._boots = False
+            self.lose("it boots", now_us)
+        elif self.target is not None and now_us - self._heard_us > SILENCE_TIMEOUT_US:
             self.lose(f"silent for {SILENCE_TIMEOUT_US / 1e6:g} s", now_us)
         _STEPS[self.phase](self, now_us)
         self._client.step(now_us)

@@ -242,7 +242,7 @@ def stop_all(processes: Sequence[Process]) -> None:
         process.close()
 
 
-def proc_status(pid: int) -> tuple[int, int, int]:
-    """Resident memory in KiB, open file descriptors, threads of a process. Linux only."""
+def proc_status(pid: int | str) -> tuple[int, int, int]:
+    """Resident memory in KiB, open file descriptors, threads of a process, or "self". Linux only."""
     fields = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines() if ":" in line)
     return int(fields["VmRSS"].split()[0]), len(os.listdir(f"/proc/{pid}/fd")), int(fields["Threads"])  # noqa: PTH208

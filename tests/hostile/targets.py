@@ -88,7 +88,7 @@ def missions(data: bytes) -> None:
     plan = VehiclePlan()
     _serve(MissionServer(plan.stores), data, MISSIONS)
     again = VehiclePlan()
-    again.load_json(plan.to_json())
+    again.load_document(plan.to_document())
     assert all(same_plan(again.stores.items(kind), plan.stores.items(kind)) for kind in range(3))
 
 

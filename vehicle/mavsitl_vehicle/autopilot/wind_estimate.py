@@ -39,6 +39,8 @@ class WindEstimate:
         self._mean = [0.0, 0.0, 0.0]
         self._variance = [0.0, 0.0, 0.0]
         self.value: Wind | None = None
+        self.update(np.zeros((13, 1)), 0.0, True)  # compiles, or reads the cache, before the clock runs
+        self.update(np.zeros((13, 1)), 0.0, False)
 
     def update(self, estimate: Floats, thrust: float, flying: bool) -> None:
         """One control period: `estimate` (13, 1), `thrust` the collective demanded during it, 0 to 1."""
