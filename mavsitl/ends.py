@@ -237,7 +237,10 @@ def vehicle_realtime(
 
             opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
         with ExitStack() as stack:
-            with Herald(wings.find_boot(wing), system_id, opened) as herald:
+            boot = (
+                None if flight.scenario.chaos else wings.find_boot(wing)
+            )  # one that misbehaves does so from the first
+            with Herald(boot, system_id, opened) as herald:
                 recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight))
                 build = wings.find(wings.VEHICLE_GROUP, wing)
                 core = build(
