@@ -237,9 +237,8 @@ def vehicle_realtime(
 
             opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
         with ExitStack() as stack:
-            boot = (
-                None if flight.scenario.chaos else wings.find_boot(wing)
-            )  # one that misbehaves does so from the first
+            # A vehicle that misbehaves does so from its first word: nobody speaks for it.
+            boot = None if flight.scenario.chaos else wings.find_boot(wing)
             with Herald(boot, system_id, opened) as herald:
                 recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight))
                 build = wings.find(wings.VEHICLE_GROUP, wing)

@@ -492,6 +492,9 @@ TABLE: Mapping[str, Row] = {
     "text-flood": Row(
         _MESSAGES, "so many STATUSTEXTs a second", telemetry.TextFlood, (Argument("hz", _hz, "50"),)
     ),
+    "text-chunk-lost": Row(
+        _MESSAGES, "the second part of a long STATUSTEXT is lost", telemetry.ChunkLost, (), "_sendChunkedStatusText"
+    ),
     "telemetry-stopped": Row(
         _MESSAGES, "telemetry ends; HEARTBEAT, texts and answers go on", telemetry.Stopped
     ),

@@ -869,6 +869,17 @@ def _(client: ChaosClient) -> None:
     assert counted(client, 2.0, "STATUSTEXT") == 200
 
 
+@mode("text-chunk-lost")
+def _(client: ChaosClient) -> None:
+    seen = len(client.inbox)
+    client.vehicle.autopilot.queue_text(4, "x" * 120)
+    client.run(0.1)
+    assert [(message.chunk_seq, len(message.text)) for message in client.since(seen, "STATUSTEXT")] == [
+        (0, 50),
+        (2, 20),
+    ]
+
+
 @mode("telemetry-stopped")
 def _(client: ChaosClient) -> None:
     seen = len(client.inbox)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import socket
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -80,11 +81,19 @@ def test_what_ends_such_a_vehicle_early_is_told() -> None:
     class Broken(Exception):
         pass
 
+    stepped = threading.Event()
+
     def step(now_us: int) -> None:
+        stepped.set()
         raise Broken
 
-    with pytest.raises(Broken), testing.vehicle() as running:
-        running.core.step = step
+    def run() -> None:
+        with testing.vehicle() as running:
+            running.core.step = step
+            assert stepped.wait(PATIENCE_S)
+
+    with pytest.raises(Broken):
+        run()
 
 
 def test_the_page_shows_scenarios_and_programs_that_work(tmp_path: Path) -> None:
