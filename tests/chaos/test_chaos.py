@@ -231,11 +231,11 @@ def test_what_is_not_there_is_named(text: str, message: str) -> None:
 def test_what_is_on_is_not_begun_twice_and_what_is_off_not_ended() -> None:
     chaos = ChaosClient().vehicle.chaos
     chaos.begin("ack-lost")
-    with pytest.raises(ChaosError, match="'ack-lost' is on already on port 'all'"):
+    with pytest.raises(ChaosError, match="'ack-lost' on port 'all' is on already"):
         chaos.begin("ack-lost")
     chaos.begin("ack-lost", "gcs")
     chaos.end("ack-lost@gcs")
-    with pytest.raises(ChaosError, match="'ack-late' is not on on port 'all'; on: ack-lost@all"):
+    with pytest.raises(ChaosError, match="'ack-late' on port 'all' is not on; on: ack-lost@all"):
         chaos.end("ack-late")
     only = Vehicle(flight(), MemoryRecorder(), seed=1, ports=("offboard",)).chaos
     with pytest.raises(ChaosError, match="this vehicle has no port 'gcs'; it has: offboard"):
@@ -287,6 +287,25 @@ def test_windows_by_the_vehicles_clock() -> None:
     assert beats == [0, 1, 5, 6, 7, 8]
     states = {(t >= 1.0, m.landed_state) for t, m in client.timed(0, "EXTENDED_SYS_STATE")}
     assert states == {(False, 1), (True, 0)}
+
+
+def test_windows_that_overlap_and_a_hand_that_interferes() -> None:
+    entries = [
+        {"mode": "ack-lost"},
+        {"mode": "heartbeat-lost", "start_s": 1.0, "duration_s": 2.0},
+        {"mode": "heartbeat-lost", "start_s": 2.0, "duration_s": 2.0},
+    ]
+    client = ChaosClient(flight(chaos=entries))
+    on = []
+    for _ in range(5):
+        client.run(1.0)
+        client.tick()
+        on.append("heartbeat-lost@all" in client.vehicle.chaos.active)
+        client.vehicle.chaos.end("ack-lost")  # by hand, and stays so until it is begun by hand
+        client.run(0.1)
+        assert "ack-lost@all" not in client.vehicle.chaos.active
+        client.begin("ack-lost")
+    assert on == [True, True, True, False, False]
 
 
 def test_windows_by_flight_time() -> None:
