@@ -393,7 +393,9 @@ def vehicle_realtime(
             opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
         live = _LiveLinks(opened, flight, speed)
         with ExitStack() as stack:
-            with Herald(wings.find_boot(wing), system_id, opened) as herald:
+            # A vehicle that misbehaves does so from its first word: nobody speaks for it.
+            boot = None if flight.scenario.chaos else wings.find_boot(wing)
+            with Herald(boot, system_id, opened) as herald:
                 recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight, log_failed))
                 build = wings.find(wings.VEHICLE_GROUP, wing)
                 core = build(

@@ -629,11 +629,9 @@ class ChaosModes(GeneratedDirective):
         for name, row in chaos.TABLE.items():
             if row.group == group:
                 defaults = ", ".join(f"{each.name} {each.default or 'all'}" for each in row.arguments)
-                mocklink = [self.code(each) for each in row.mocklink.split(", ") if each]
-                cells = [
-                    node for index, each in enumerate(mocklink) for node in ([nodes.Text(" ")] * bool(index)) + each
-                ]
-                rows.append([self.code(row.usage(name)), self.text(row.text), self.text(defaults), cells])
+                mocklink = " ".join(f"`{each}`" for each in row.mocklink.split(", ") if each)
+                cells = (row.text, defaults, mocklink)
+                rows.append([self.code(row.usage(name)), *(self.text(cell) for cell in cells)])
         return self.section(group, self.table(("mode", "what goes wrong", "defaults", "MockLink's name"), rows))
 
 

@@ -51,7 +51,9 @@ class Chaos:
         self._note = note
         self._active: dict[tuple[str, str], Spec] = {}
         """By what was asked for and the port's name."""
-        self._windows: list[tuple[ChaosWindow, bool]] = []
+        self._windows: list[ChaosWindow] = []
+        self._scheduled: dict[tuple[str, str], None] = {}
+        """What is on because one of the windows is open."""
         for each in self._ports:
             each.now_us = now_us
 
@@ -67,7 +69,7 @@ class Chaos:
         """
         key, spec = self._key(mode, port)
         if key in self._active:
-            raise ChaosError(f"chaos mode '{key[0]}' is on already on port '{key[1]}'")
+            raise ChaosError(f"chaos mode '{key[0]}' on port '{key[1]}' is on already")
         self._active[key] = spec
         for each in self._ports:
             if key[1] in (ALL_PORTS, each.name):
@@ -78,7 +80,7 @@ class Chaos:
         """End what `begin` began with the same words. Raises `ChaosError` where that is not on."""
         key, _ = self._key(mode, port)
         if key not in self._active:
-            raise ChaosError(f"chaos mode '{key[0]}' is not on on port '{key[1]}'; on: {', '.join(self.active) or '-'}")
+            raise ChaosError(f"chaos mode '{key[0]}' on port '{key[1]}' is not on; on: {', '.join(self.active) or '-'}")
         del self._active[key]
         for each in self._ports:
             each.end(key)
@@ -104,24 +106,38 @@ class Chaos:
                     self.end(mode, port)
 
     def schedule(self, windows: Sequence[ChaosWindow]) -> None:
-        """A scenario's `[[chaos]]`: each is on in its time window. Raises `ChaosError` as `begin`."""
+        """A scenario's `[[chaos]]`: each is on in its time window. Raises `ChaosError` as `begin`.
+
+        Where windows of one mode and port overlap, it is on while one of them is open.
+        """
         for window in windows:
             self._key(window.mode, window.port)
-        self._windows += [(window, False) for window in windows]
+        self._windows += windows
 
     def step(self, now_us: int, flight_time_s: float) -> None:
         """Once a tick, before anything is sent: begin and end what is scheduled, and let modes act by themselves."""
         for each in self._ports:
             each.now_us = now_us
-        for index, (window, on) in enumerate(self._windows):
-            clock_s = now_us * 1e-6 if window.clock == "simulated" else flight_time_s
-            end_s = float("inf") if window.duration_s is None else window.start_s + window.duration_s
-            inside = window.start_s <= clock_s < end_s
-            if inside is not on:
-                self._windows[index] = (window, inside)
-                (self.begin if inside else self.end)(window.mode, window.port)
+        if self._windows:
+            self._keep_schedule(now_us * 1e-6, flight_time_s)
         for each in self._ports:
             each.step()
+
+    def _keep_schedule(self, simulated_s: float, flight_time_s: float) -> None:
+        wanted: dict[tuple[str, str], None] = {}
+        for window in self._windows:
+            clock_s = simulated_s if window.clock == "simulated" else flight_time_s
+            if window.start_s <= clock_s and (
+                window.duration_s is None or clock_s < window.start_s + window.duration_s
+            ):
+                wanted[window.mode, window.port] = None
+        before, self._scheduled = self._scheduled, wanted
+        for key in wanted:
+            if key not in before and key not in self._active:
+                self.begin(*key)
+        for key in before:
+            if key not in wanted and key in self._active:
+                self.end(*key)
 
     def _key(self, mode: str, port: str | None) -> tuple[tuple[str, str], Spec]:
         spec = parse(mode)

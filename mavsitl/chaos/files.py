@@ -6,7 +6,7 @@ import struct
 from collections import OrderedDict
 from collections.abc import Sequence
 
-from mavsitl.chaos.base import NOTHING, REMEMBERED, Message, Mode, Peer, Repeats, altered, ids
+from mavsitl.chaos.base import NOTHING, REMEMBERED, Message, Mode, Peer, altered, ids
 from mavsitl.dialect import mavlink
 from mavsitl.services.ftp import FtpError, FtpPayload, Opcode
 
@@ -65,19 +65,28 @@ class Nak(Mode):
 
 
 class SecondSilent(Mode):
-    """Requests of a transfer that has begun are not looked at: all, or the first `times` after it began."""
+    """Requests of a transfer that has begun are not looked at: all, or (`once`) the first after it began."""
 
     takes = FTP
 
-    def __init__(self, times: int) -> None:
-        self._repeats = Repeats(times) if times else None
+    def __init__(self, *, once: bool) -> None:
+        self._once = once
+        self._begun: OrderedDict[Peer, None] = OrderedDict()
+        """Clients whose transfer has begun and lost nothing yet."""
 
     def incoming(self, message: Message, sender: Peer) -> Message | None:
         request = _payload(message)
         if not _is_later(request):
+            self._begun[sender] = None
+            if len(self._begun) > REMEMBERED:
+                self._begun.popitem(last=False)
             return message
-        key = (sender, request.opcode, request.offset)
-        return None if self._repeats is None or self._repeats.fails(key) else message
+        if not self._once:
+            return None
+        if sender not in self._begun:
+            return message
+        del self._begun[sender]
+        return None
 
 
 class SequenceWrong(Mode):

@@ -411,11 +411,12 @@ TABLE: Mapping[str, Row] = {
         (Argument("error", _enumeration("MAV_FTP_ERR"), "FAIL"),), "errModeNakResponse",
     ),
     "ftp-second-silent": Row(
-        _FTP, "opening is answered, nothing after it", lambda: files.SecondSilent(0), (), "errModeNoSecondResponse"
+        _FTP, "opening is answered, nothing after it", lambda: files.SecondSilent(once=False), (),
+        "errModeNoSecondResponse",
     ),
     "ftp-second-first-silent": Row(
-        _FTP, "after opening, each request is not looked at once; a repeat is answered",
-        lambda: files.SecondSilent(1), (), "errModeNoSecondResponseAllowRetry",
+        _FTP, "the first request after opening is not looked at; a repeat is answered",
+        lambda: files.SecondSilent(once=True), (), "errModeNoSecondResponseAllowRetry",
     ),
     "ftp-second-nak": Row(
         _FTP, "opening is answered, everything after it refused with this MAV_FTP_ERR",
@@ -490,6 +491,9 @@ TABLE: Mapping[str, Row] = {
     ),
     "text-flood": Row(
         _MESSAGES, "so many STATUSTEXTs a second", telemetry.TextFlood, (Argument("hz", _hz, "50"),)
+    ),
+    "text-chunk-lost": Row(
+        _MESSAGES, "the second part of a long STATUSTEXT is lost", telemetry.ChunkLost, (), "_sendChunkedStatusText"
     ),
     "telemetry-stopped": Row(
         _MESSAGES, "telemetry ends; HEARTBEAT, texts and answers go on", telemetry.Stopped

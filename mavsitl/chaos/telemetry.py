@@ -137,6 +137,15 @@ class TextFlood(Mode):
             self.line.send(mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_WARNING, text))
 
 
+class ChunkLost(Mode):
+    """The second part of every STATUSTEXT that has several."""
+
+    gives = ids("STATUSTEXT")
+
+    def outgoing(self, message: Message) -> Sequence[Message]:
+        return NOTHING if message.chunk_seq == 1 else (message,)
+
+
 V2 = 0xFD
 UNKNOWN_ID = 0xFFFFF0
 """No dialect has this message."""

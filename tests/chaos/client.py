@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mavsitl.codec import Frame, encode, parse
+from mavsitl.codec import Frame, parse
 from mavsitl.dialect import mavlink
 from tests.autopilot.conftest import GCS, OFFBOARD, Client
 
@@ -138,7 +138,3 @@ def asked(said: list[Any]) -> list[int]:
     """The items asked for or sent, in order, repeats and all."""
     kinds = ("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ITEM_INT")
     return [message.seq for message in said if message.get_type() in kinds]
-
-
-def numbered(frame: Frame) -> bytes:
-    return encode(frame.message, frame.sequence, frame.system_id, frame.component_id)

@@ -657,7 +657,10 @@ def _(client: ChaosClient) -> None:
     opened(client)
     assert read(client, 2) == []
     assert [reply.data for reply in read(client, 2)] == [content()[:80]]
-    assert read(client, 3, 80) == []
+    assert len(read(client, 3, 80)) == 1
+    ftp(client, Opcode.TERMINATE_SESSION, 4)
+    opened(client)
+    assert read(client, 2) == []
 
 
 @mode("ftp-second-nak:FAIL")
@@ -864,6 +867,17 @@ def _(client: ChaosClient) -> None:
 @mode("text-flood:100")
 def _(client: ChaosClient) -> None:
     assert counted(client, 2.0, "STATUSTEXT") == 200
+
+
+@mode("text-chunk-lost")
+def _(client: ChaosClient) -> None:
+    seen = len(client.inbox)
+    client.vehicle.autopilot.queue_text(4, "x" * 120)
+    client.run(0.1)
+    assert [(message.chunk_seq, len(message.text)) for message in client.since(seen, "STATUSTEXT")] == [
+        (0, 50),
+        (2, 20),
+    ]
 
 
 @mode("telemetry-stopped")

@@ -19,14 +19,14 @@ from mavsitl import __version__, cli, pair, scenario
 from mavsitl.cli import main
 from mavsitl.link.udp import LOOPBACK
 
-COMMANDS = ("fly", "vehicle", "ground", "check", "link", "inject", "param", "report", "scenarios")
+COMMANDS = ("fly", "vehicle", "ground", "check", "link", "inject", "param", "report", "scenarios", "chaos")
 
 HELP = {
     "fly": ("--seed", "--airframe", "--law", "--level", "--wind-information", "--duration", "--set", "--run-dir",
             "--in-memory", "--no-report", "--json", "report.html", "mavsitl fly hover-wind --law pid"),
     "vehicle": ("--instance", "--system", "--bind", "--offboard-port", "--offboard-remote", "--gcs-port",
                 "--gcs-remote", "--lockstep", "--deadline", "--run-dir", "--wing", "--status", "--speed",
-                "--until-disarmed", "14580", "18570", "mavsitl vehicle hover-wind --instance 1"),
+                "--until-disarmed", "--chaos", "14580", "18570", "mavsitl vehicle hover-wind --instance 1"),
     "ground": ("--link", "--system", "--vehicle", "--lockstep", "--deadline", "--run-dir", "--wing", "--status",
                "udpin:127.0.0.1:14540", "mavsitl ground spiral-calm --link udpout:"),
     "check": ("--listen", "--for", "--quiet", "--all", "--json", "14550", "14540", "18570", "Exit codes",
@@ -40,6 +40,7 @@ HELP = {
               "Exit codes", "mavsitl param set COM_OF_LOSS_T=0.5"),
     "report": ("RUN", "run.json", "report.html"),
     "scenarios": ("--json",),
+    "chaos": ("--json", "NAME[:ARGUMENT...][@PORT]", "ack-late:2.5:NAV_TAKEOFF@gcs"),
 }  # fmt: skip
 
 
@@ -153,6 +154,8 @@ MISTAKES: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "infinite speed": (["vehicle", "--speed", "inf"], ("--speed", "'inf'", "finite number above 0")),
     "too slow": (["vehicle", "--speed", "0.1"], ("--speed", "'0.1'", "0.5 or more")),
     "paced lock-step": (["vehicle", "--lockstep", "--speed", "2"], ("--speed", "not with --lockstep")),
+    "lock-step's chaos": (["vehicle", "--lockstep", "--chaos", "mute"], ("--chaos", "not with --lockstep")),
+    "no such chaos": (["vehicle", "--chaos", "ack-lst"], ("no chaos mode 'ack-lst'", "did you mean ack-lost")),
     "lock-step's gcs": (["vehicle", "--lockstep", "--gcs-port", "18570"], ("--gcs-port", "not with --lockstep")),
     "deadline in real time": (["vehicle", "--deadline", "3"], ("--deadline", "only with --lockstep")),
     "vehicle in real time": (["ground", "--vehicle", "127.0.0.1:1"], ("--vehicle", "only with --lockstep")),
