@@ -326,9 +326,9 @@ HEAD = """\
 # When fail-safes act
 
 Each fail-safe of [the table](mavlink.md#fail-safes), flown once in simulated time: the vehicle's core, over its
-datagrams. Due is what the parameters say from the cause to the action; acted is when the first `HEARTBEAT` shows it, for
-a warning its `STATUSTEXT`. Where it holds first, `COM_FAIL_ACT_T` (5 s) comes between. What may be late by 0.1 s was
-late by {late_ms:.0f} ms at most.
+datagrams. Due is what the parameters say from the cause to the action; acted is when the first `HEARTBEAT` shows it,
+for a warning its `STATUSTEXT`. Where it holds first, `COM_FAIL_ACT_T` (5 s) comes between. What may be late by 0.1 s
+was late by {late_ms:.0f} ms at most.
 
 | fail-safe | counted from | parameters | due, s | acted, s | held, s | then |
 |---|---|---|---:|---:|---:|---|

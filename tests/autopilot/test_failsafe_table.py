@@ -709,7 +709,7 @@ EVENTS = st.one_of(
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(PARAMETERS, st.lists(EVENTS, max_size=25))
 def test_whatever_happens(parameters: dict[str, float], events: list[Any]) -> None:
-    """Nothing raises; a terminated flight stays so; who is disarmed is in no fail-safe; what flies can be flown."""
+    """Nothing raises; a termination stays; who is disarmed is in no fail-safe; what flies has its estimates."""
     values = {name: row.default for name, row in TABLE.items()} | parameters
     said: list[str] = []
     commander = Commander(values, lambda severity, text: said.append(text))
@@ -741,6 +741,12 @@ def test_whatever_happens(parameters: dict[str, float], events: list[Any]) -> No
             if commander.failsafe:
                 assert commander.mode in ACTION_MODES.values()
                 assert commander.cannot_fly(commander.mode) is None
+            if commander.armed:
+                needs = MODES[commander.mode].needs
+                assert situation.attitude_valid or Need.ATTITUDE not in needs
+                assert situation.height_valid or Need.HEIGHT not in needs
+                assert situation.velocity_valid or Need.VELOCITY not in needs
+                assert situation.position_valid or Need.POSITION not in needs
     assert all(len(text) < 200 for text in said)
 
 

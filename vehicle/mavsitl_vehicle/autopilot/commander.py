@@ -178,6 +178,8 @@ class Failsafe(NamedTuple):
     """A return or landing is preceded by COM_FAIL_ACT_T of holding, in which the user may take over."""
     ends_with_cause: bool = False
     """The user's mode returns with the signal; otherwise a mode change or disarming ends it."""
+    overruled: bool = True
+    """By the user's choice of a mode; otherwise only by one in which it does not trip."""
     sticks_end_hold: bool = True
     """Moved sticks take over from its Hold, too."""
     regained: str = ""
@@ -284,7 +286,7 @@ class Commander:
         if reason:
             self._report(mavlink.MAV_SEVERITY_WARNING, f"{modes.TABLE[mode].name} refused: {reason}")
             return TEMPORARILY_REJECTED
-        self._overridden |= self._tripped.keys()
+        self._overridden |= self._tripped.keys() - _NOT_OVERRULED
         self._delay.end()
         self._choose(mode)
         return ACCEPTED
@@ -801,7 +803,8 @@ FAILSAFES: tuple[Failsafe, ...] = (
     ),
     *(
         Failsafe(
-            f"{name} estimate lost", _estimate_lost(need, name), _fallback_action, deferred=False, ends_with_cause=True
+            f"{name} estimate lost", _estimate_lost(need, name), _fallback_action, deferred=False,
+            ends_with_cause=True, overruled=False,
         )
         for need, name in (
             (Need.ATTITUDE, "attitude"), (Need.HEIGHT, "height"), (Need.VELOCITY, "velocity"),
@@ -826,3 +829,5 @@ FAILSAFES: tuple[Failsafe, ...] = (
     Failsafe("kill switch engaged", _killed, _always(_A.DISARM), after="COM_KILL_DISARM"),
 )  # fmt: skip
 """New rows go to the end: the reference lists them in this order."""
+
+_NOT_OVERRULED = {row.name for row in FAILSAFES if not row.overruled}
