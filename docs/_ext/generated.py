@@ -37,8 +37,8 @@ from typing import Any, ClassVar, NamedTuple
 import msgspec
 from docutils import nodes
 from mavsitl_vehicle.autopilot import commands, modes, plan, telemetry
-from mavsitl_vehicle.autopilot.commander import FAILSAFES, Action, Commander, Failsafe, Situation
-from mavsitl_vehicle.autopilot.modes import Control, Mode
+from mavsitl_vehicle.autopilot.commander import FAILSAFES, Action, By, Commander, Failsafe, Situation
+from mavsitl_vehicle.autopilot.modes import Control, Mode, Need
 from mavsitl_vehicle.autopilot.parameters import TABLE, Parameter
 from mavsitl_vehicle.vehicle import Vehicle
 from sphinx.application import Sphinx
@@ -367,39 +367,54 @@ CONTROLS = {
 }
 
 
-class Read(dict[str, float]):
-    """Parameters at their defaults that note which of them were read."""
+NEEDS = {
+    Need.ATTITUDE: "attitude",
+    Need.HEIGHT: "height",
+    Need.VELOCITY: "velocity",
+    Need.POSITION: "position",
+    Need.HOME: "home",
+    Need.MISSION: "mission",
+    Need.STREAM: "setpoints",
+    Need.STICKS: "sticks",
+    Need.LIMITS: "limits",
+}
 
-    def __init__(self, **changes: float) -> None:
-        super().__init__({name: row.default for name, row in TABLE.items()} | changes)
-        self.names: list[str] = []
 
-    def __getitem__(self, name: str) -> float:
-        if name not in self.names:
-            self.names.append(name)
-        return super().__getitem__(name)
+def values(**changes: float) -> dict[str, float]:
+    """Parameters at their defaults but for some."""
+    return {name: row.default for name, row in TABLE.items()} | changes
 
 
 WELL = Situation(landed=False, setpoint_age_us=0, sticks_age_us=0, gcs_age_us=0, mission_refusal=None)
 """In the air, and everything there."""
-CAUSES: Mapping[str, Mapping[str, Any]] = {
-    "off-board signal lost": {"setpoint_age_us": None, "sticks_age_us": None},
-    "manual control lost": {"sticks_age_us": None},
-    "connection to ground station lost": {"gcs_age_us": None},
-    "low battery": {"battery_level": 1},
-    "critical battery": {"battery_level": 2},
-    "emergency battery level": {"battery_level": 3},
-    "geofence breached": {"fence_breach": "too far"},
+CAUSES: Mapping[str, tuple[Mapping[str, Any], Mapping[str, float]]] = {
+    "off-board signal lost": ({"setpoint_age_us": None, "sticks_age_us": None}, {}),
+    "manual control lost": ({"sticks_age_us": None}, {}),
+    "connection to ground station lost": ({"gcs_age_us": None}, {}),
+    "low battery": ({"battery_level": 1}, {}),
+    "critical battery": ({"battery_level": 2}, {}),
+    "emergency battery level": ({"battery_level": 3}, {}),
+    "geofence breached": ({"fence_breach": "too far"}, {}),
+    "both links lost after the mission": ({"gcs_age_us": None, "mission_finished": True}, {"COM_RC_IN_MODE": 4}),
+    "battery unhealthy": ({"battery_age_us": 10_000_000}, {}),
+    "remaining flight time low": ({"return_margin_s": -1.0}, {}),
+    "flight time nearly over": ({"airborne_s": 95.0}, {"COM_FLT_TIME_MAX": 100}),
+    "maximum flight time exceeded": ({"airborne_s": 101.0}, {"COM_FLT_TIME_MAX": 100}),
+    "strong wind": ({"wind_m_s": 11.0}, {"COM_WIND_WARN": 10}),
+    "wind limit exceeded": ({"wind_m_s": 11.0}, {"COM_WIND_MAX": 10}),
+    "mission failure": ({"mission_failure": "no mission"}, {}),
+    "position accuracy low": ({"position_error_m": 11.0}, {"COM_POS_LOW_EPH": 10}),
+    "attitude estimate lost": ({"attitude_valid": False}, {}),
+    "height estimate lost": ({"height_valid": False}, {}),
+    "velocity estimate lost": ({"velocity_valid": False}, {}),
+    "position estimate lost": ({"position_valid": False}, {}),
+    "attitude failure (roll)": ({"roll_rad": 2.0}, {"CBRK_FLIGHTTERM": 0}),
+    "attitude failure (pitch)": ({"pitch_rad": 1.5}, {"CBRK_FLIGHTTERM": 0}),
+    "altitude loss": ({"altitude_loss_m": 11.0}, {"FD_ALT_LOSS": 10, "CBRK_FLIGHTTERM": 0}),
+    "motor failure": ({"motor_failure": 1}, {"FD_ACT_EN": 1}),
+    "kill switch engaged": ({}, {}),
 }
-"""What makes each fail-safe trip; who flies off-board has no sticks."""
-THRESHOLDS: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(CAUSES, ()),
-    "low battery": ("BAT_LOW_THR",),
-    "critical battery": ("BAT_CRIT_THR",),
-    "emergency battery level": ("BAT_EMERGEN_THR",),
-    "geofence breached": ("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST"),
-}
-"""Parameters by which others than the commander see what makes it trip: battery and fence."""
+"""What makes each fail-safe trip, of `Situation` and of the parameters; who flies off-board has no sticks."""
 LONG_US = 60_000_000
 """Beyond COM_FAIL_ACT_T."""
 
@@ -419,26 +434,18 @@ def flying(mode: Mode, parameters: Mapping[str, float]) -> Commander:
 
 
 class Modes(GeneratedDirective):
-    """`modes.TABLE`, and what the commander wants for each."""
+    """`modes.TABLE`."""
 
     def run(self) -> list[nodes.Node]:
         rows = []
-        for mode, info in modes.TABLE.items():
-            commander = Commander(Read(), lambda severity, text: None)
-            # Landing is never refused, and a mode that nobody can ask for needs nothing.
-            needs = {
-                Control.STICKS: "sticks",
-                Control.STREAM: "setpoints",
-            }.get(info.control) or {Mode.MISSION: "mission", Mode.RTL: "home"}.get(mode)
-            if bool(needs) != bool(commander.cannot_fly(mode)):
-                raise self.error(f"{mode}: the commander wants {commander.cannot_fly(mode)!r}, the page says {needs!r}")
+        for info in modes.TABLE.values():
             standard = enum_name("MAV_STANDARD_MODE", info.standard_mode) if info.standard_mode else ""
             cells = (
                 info.title,
                 f"{info.main_mode}, {info.sub_mode}",
                 standard,
                 CONTROLS[info.control],
-                needs or "",
+                ", ".join(NEEDS[need] for need in Need if need in info.needs),
                 "yes" if info.can_arm else "no",
                 "yes" if info.selectable else "no",
             )
@@ -469,7 +476,7 @@ def changes() -> Iterator[Change]:
     yield Change("take-off height reached", Mode.LOITER, (Mode.TAKEOFF,))  # Autopilot.decide: commander.complete
     ends: dict[Mode, list[Mode]] = {}
     for mode in Mode:
-        commander = flying(mode, Read())
+        commander = flying(mode, values())
         commander.request_arm(False, True, 0)
         if commander.mode is not mode:
             ends.setdefault(commander.mode, []).append(mode)
@@ -480,35 +487,27 @@ def changes() -> Iterator[Change]:
 
 
 def failsafe_changes(row: Failsafe) -> Iterator[Change]:
-    parameter, actions = by_value(row)
-    default = int(TABLE[parameter].default)
-    acting = [value for value, action in actions.items() if action > Action.WARN]
-    if not acting:
-        return
-    value = default if default in acting else acting[0]
+    situation, parameters = CAUSES[row.name]
+    why = row.name
+    if isinstance(row.action, By):
+        name, actions = row.action.parameter, row.action.actions
+        acting = [value for value in sorted(actions) if actions[value] > Action.WARN]
+        if not acting:
+            return
+        default = int(TABLE[name].default)
+        value = default if default in acting else acting[0]
+        parameters = {**parameters, name: value}
+        why = f"{row.name} ({name} {value})"
     found: dict[Mode, list[Mode]] = {}
     for mode in Mode:
-        commander = flying(mode, Read(**{parameter: value}))
-        commander.situation = WELL._replace(**CAUSES[row.name])
-        tripped = row.tripped(commander)
-        for now_us in (1, LONG_US):
-            commander.step(now_us, commander.situation)
-        if tripped and commander.mode is not mode:
+        commander = flying(mode, values(**parameters))
+        tripped = WELL._replace(**situation)
+        for now_us in (LONG_US, 2 * LONG_US, 3 * LONG_US):
+            commander.step(now_us, tripped)
+        if commander.armed and commander.mode is not mode:
             found.setdefault(commander.mode, []).append(mode)
     for target, sources in found.items():
-        yield Change(f"{row.name} ({parameter} {value})", target, tuple(sources))
-
-
-def by_value(row: Failsafe) -> tuple[str, dict[int, Action]]:
-    """The parameter that decides on a fail-safe's action, and the action at each of its values."""
-    parameters = Read()
-    commander = flying(Mode.LOITER, parameters)
-    parameters.names.clear()
-    row.action(commander)
-    parameter = parameters.names[0]
-    return parameter, {
-        value: row.action(flying(Mode.LOITER, Read(**{parameter: value}))) for value in sorted(TABLE[parameter].values)
-    }
+        yield Change(why, target, tuple(sources))
 
 
 class ModeChanges(GeneratedDirective):
@@ -558,27 +557,18 @@ class Failsafes(GeneratedDirective):
             raise self.error("CAUSES and commander.FAILSAFES name different fail-safes")
         rows = []
         for row in FAILSAFES:
-            parameter, actions = by_value(row)
-            names = (*self.looked_at(row, parameter, actions), *THRESHOLDS[row.name])
+            names = (*row.looks_at, row.after) if row.after else row.looks_at
             watched = ", ".join(f"`{name}`" for name in names)
-            does = ", ".join(f"{value}: {action.name.lower()}" for value, action in actions.items())
-            before = "`COM_FAIL_ACT_T` of holding before a return or landing" if row.deferred else "at once"
+            if isinstance(row.action, By):
+                name, actions = row.action.parameter, row.action.actions
+                does = ", ".join(f"{value}: {action.name.lower()}" for value, action in sorted(actions.items()))
+                does = f"`{name}` (default {TABLE[name].default:g}): {does}"
+            else:
+                does = " ".join((row.action.__doc__ or "").split())
+            before = "`COM_FAIL_ACT_T` of holding before it leaves" if row.deferred else "at once"
             ends = "with its cause" if row.ends_with_cause else "by a mode change or disarming"
-            text = f"`{parameter}` (default {TABLE[parameter].default:g}): {does}"
-            rows.append([self.text(cell) for cell in (row.name, watched, text, before, ends)])
+            rows.append([self.text(cell) for cell in (row.name, watched, does, before, ends)])
         return [self.table(("fail-safe", "looks at", "does", "when", "ends"), rows)]
-
-    def looked_at(self, row: Failsafe, parameter: str, actions: Mapping[int, Action]) -> list[str]:
-        """The parameters that the row reads in any mode, besides the one that decides on the action."""
-        acting = max(actions, key=lambda value: actions[value] > Action.WARN)
-        names: dict[str, None] = {}
-        for mode in Mode:
-            parameters = Read(**{parameter: acting})
-            commander = flying(mode, parameters)
-            parameters.names.clear()
-            row.tripped(commander)
-            names |= dict.fromkeys(parameters.names)
-        return [name for name in names if name != parameter]
 
 
 class ParameterTables(GeneratedDirective):

@@ -52,7 +52,7 @@ ON_THE_GROUND: list[Case] = [
     (M.MAV_CMD_DO_SET_STANDARD_MODE, (7,), ACCEPTED, ""),
     (M.MAV_CMD_DO_SET_STANDARD_MODE, (3,), DENIED, "Mode refused: standard mode 3 is not available"),
     (M.MAV_CMD_DO_FLIGHTTERMINATION, (1,), DENIED, "Termination refused: not armed"),
-    (M.MAV_CMD_DO_FLIGHTTERMINATION, (0,), DENIED, "Termination refused: param1 is 0, need 1"),
+    (M.MAV_CMD_DO_FLIGHTTERMINATION, (3,), DENIED, "Termination refused: param1 is 3, need 0, 1 or 2"),
     (M.MAV_CMD_NAV_TAKEOFF, (), ACCEPTED, ""),
     (M.MAV_CMD_NAV_TAKEOFF, (nan, nan, nan, nan, 99, 0, 500), DENIED, "Take-off refused: latitude 99 deg is not"),
     (M.MAV_CMD_NAV_LAND, (), ACCEPTED, ""),

@@ -43,7 +43,9 @@ def test_a_terminated_flight_stays_terminated(situation: Situation) -> None:
     assert commander.mode is Mode.TERMINATION
     assert commander.request_mode(Mode.TERMINATION, "") == ACCEPTED
     assert commander.request_arm(False, True, 20 * SECOND_US) == ACCEPTED
-    assert (commander.armed, commander.mode) == (False, Mode.LOITER)
+    assert (commander.armed, commander.mode) == (False, Mode.TERMINATION)
+    assert commander.request_arm(True, True, 21 * SECOND_US) == TEMPORARILY_REJECTED
+    assert said[-1] == "Arming denied: flight termination active, a reboot ends it"
 
 
 def test_a_termination_by_a_fail_safe_outlives_its_cause() -> None:

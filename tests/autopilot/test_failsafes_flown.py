@@ -6,7 +6,6 @@ from collections.abc import Callable
 from math import hypot
 
 import pytest
-from mavsitl_vehicle.autopilot.commander import FAILSAFES
 
 from mavsitl.dialect import mavlink
 from tests.autopilot.conftest import GCS, Client, flight
@@ -56,18 +55,6 @@ def up_with(each: Callable[[Client], Callable[[], int]], **parameters: float) ->
     client.run(6.0, send)
     assert client.flight_mode == HOLD
     return client, send
-
-
-def test_this_file_knows_every_row() -> None:
-    assert [row.name for row in FAILSAFES] == [
-        "off-board signal lost",
-        "manual control lost",
-        "connection to ground station lost",
-        "low battery",
-        "critical battery",
-        "emergency battery level",
-        "geofence breached",
-    ]
 
 
 # --- off-board
@@ -193,11 +180,15 @@ def test_sticks_missing_at_arming_are_not_missed() -> None:
     assert not client.critical
 
 
-def test_lost_sticks_are_no_matter_in_automatic_modes() -> None:
-    client, _ = up_with(sticks)
+@pytest.mark.parametrize(
+    ("exceptions", "in_mode", "missed"), [(0, 1, True), (1, 1, True), (2, 1, False), (0, 4, False)]
+)
+def test_sticks_are_missed_in_automatic_modes_too(exceptions: int, in_mode: int, missed: bool) -> None:
+    client, _ = up_with(sticks, COM_RCL_EXCEPT=exceptions)
+    set_parameter(client, "COM_RC_IN_MODE", in_mode)
     client.run(3.0)
     assert client.flight_mode == HOLD
-    assert not client.critical
+    assert client.critical == missed
 
 
 # --- ground station

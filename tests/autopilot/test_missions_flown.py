@@ -276,15 +276,19 @@ def test_the_same_mission_uploaded_again_goes_on() -> None:
     assert (current(client).seq, current(client).mission_state) == (1, ACTIVE)
 
 
-def test_a_mission_cleared_in_flight_holds() -> None:
+def test_a_mission_cleared_in_flight_holds_and_returns() -> None:
     client = ready()
     begin(client, [takeoff(client, 3.0), waypoint(client, 20, 0, 3)])
     client.run_until(lambda: client.truth[0] > 4.0, 20.0)
     client.send(mavlink.MAVLink_mission_clear_all_message(1, 1, 0))
-    client.run(6.0)
+    client.run(4.8)
     assert client.truth[0] < 14.0
     assert hypot(*client.truth[3:6]) < 0.05
     assert client.truth[2] == pytest.approx(3.0, abs=0.1)
+    assert (client.flight_mode, client.critical) == (HOLD, True)
+    client.run(0.3)  # COM_FAIL_ACT_T
+    assert client.flight_mode == RETURN
+    assert client.texts()[-1] == "Failsafe activated: mission failure, return"
 
 
 def test_progress_is_told_on_both_links() -> None:

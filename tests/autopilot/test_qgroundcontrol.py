@@ -235,7 +235,7 @@ class Station(Client):
     def plan(self, mission_type: int) -> list[Any]:
         """Download of one of the three lists."""
         listing = mavlink.MAVLink_mission_request_list_message(1, 1, mission_type)
-        count = self.ask(listing, _of_type("MISSION_COUNT", mission_type), PLAN_S, PLAN_TRIES).count
+        count = self.ask(listing, _of_type("MISSION_COUNT", mission_type), PLAN_S, 2 * PLAN_TRIES).count
         items: list[Any] = []
         while len(items) < count:
             wanted = len(items)

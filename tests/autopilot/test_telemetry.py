@@ -183,8 +183,8 @@ def test_autopilot_version() -> None:
 
 def test_available_modes() -> None:
     everything = sent(Told(), "AVAILABLE_MODES")
-    assert [m.mode_index for m in everything] == list(range(1, len(modes.TABLE) + 1))
-    assert {m.number_modes for m in everything} == {len(modes.TABLE)}
+    assert [m.mode_index for m in everything] == list(range(1, len(modes.LISTED) + 1))
+    assert {m.number_modes for m in everything} == {len(modes.LISTED)}
     by_custom = {m.custom_mode: m for m in everything}
     hold, land, offboard = by_custom[0x03040000], by_custom[0x06040000], by_custom[0x00060000]
     assert (hold.standard_mode, hold.mode_name, hold.properties) == (0, "Hold", 0)
@@ -193,7 +193,7 @@ def test_available_modes() -> None:
     assert by_custom[0x000A0000].properties & mavlink.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE
     for index, each in enumerate(everything, 1):
         assert one(Told(), "AVAILABLE_MODES", index).custom_mode == each.custom_mode
-    for index in (-1, len(modes.TABLE) + 1, 2**31):
+    for index in (-1, len(modes.LISTED) + 1, 2**31):
         assert sent(Told(), "AVAILABLE_MODES", index) == []
     assert one(Told(), "AVAILABLE_MODES_MONITOR").seq == 0
 

@@ -92,6 +92,7 @@ TABLE: Mapping[tuple[Unit, Kind], str] = {
     (Unit.BATTERY, Kind.OFF): "It reads empty, as PX4's simulated battery does; the rotors turn on.",
     (Unit.BATTERY, Kind.STUCK): "Charge, voltage and current stay as last measured, while the pack drains on.",
     (Unit.BATTERY, Kind.WRONG): "It collapses: charge and voltage fall at once. Well again, it has what it would have.",
+    (Unit.BATTERY, Kind.SLOW): "It is measured every 20 s: unhealthy from 5 s on, until the next.",
     (Unit.MOTOR, Kind.OFF): "The rotor stands still. Its speed controller reports no speed.",
     (Unit.MOTOR, Kind.STUCK): "The rotor keeps its speed while armed. Its speed controller reports nothing any more.",
     (Unit.MOTOR, Kind.GARBAGE): "The rotor turns at any speed, another one every 0.1 s while armed.",

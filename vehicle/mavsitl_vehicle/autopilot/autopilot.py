@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, inf, isfinite, nan, radians
+from math import cos, hypot, inf, isfinite, nan, radians
 from typing import Protocol
 
 from mavsitl.codec import Frame, Message
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector
 from mavsitl.geodesy import Origin
+from mavsitl.quaternion import to_euler
 from mavsitl.routing import Router
 from mavsitl.scenario import Flight
 from mavsitl.services.statustext import TextLimiter, chunks
@@ -18,12 +19,14 @@ from mavsitl_vehicle.autopilot.battery import Battery, Level
 from mavsitl_vehicle.autopilot.battery import settings as battery_settings
 from mavsitl_vehicle.autopilot.commander import ACCEPTED, Commander, Situation
 from mavsitl_vehicle.autopilot.course import MissionCourse
-from mavsitl_vehicle.autopilot.health import Health, summary
+from mavsitl_vehicle.autopilot.failure_detector import AltitudeLoss
+from mavsitl_vehicle.autopilot.health import Health, Validity, summary
 from mavsitl_vehicle.autopilot.landing import IN_AIR, LANDING, TAKING_OFF, LandDetector
-from mavsitl_vehicle.autopilot.modes import Control, Mode
+from mavsitl_vehicle.autopilot.modes import Control, Mode, Need
 from mavsitl_vehicle.autopilot.navigator import Navigator
 from mavsitl_vehicle.autopilot.parameters import Parameters
 from mavsitl_vehicle.autopilot.pilot import Pilot
+from mavsitl_vehicle.autopilot.plan import COMPLETE as MISSION_COMPLETE
 from mavsitl_vehicle.autopilot.plan_watch import PlanWatch
 from mavsitl_vehicle.autopilot.ports import COMPONENT_ID, Port, Shared, component_metadata
 from mavsitl_vehicle.autopilot.position import PositionControl
@@ -50,8 +53,15 @@ ANSWERS_HZ, ANSWERS_BURST = 2.0, 10.0
 """Texts of one kind that commands, modes and plans are answered by."""
 LOOK_US = 12_000
 """So often the commander decides (PX4's: every 10 ms). A command, or a stream that returns, makes it look at once."""
+WATCH_US = 40_000
+"""So often fence, plan and the way back are looked at in flight."""
 HOUSEKEEPING_US = 100_000
 """Battery, fence, health: what needs no control period."""
+SLOW_BATTERY_US = 20_000_000
+"""Between two measurements of a battery that is slow."""
+
+
+_ALL_VALID = Validity()
 
 
 class Body(Protocol):
@@ -105,6 +115,8 @@ class Autopilot:
         """Position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s: what telemetry says."""
         self._status = known(scenario.noise)
         self.accuracy = telemetry.accuracy(self._status)
+        self.valid = Validity()
+        """Which parts of the estimate are good for flying."""
         start = scenario.start
         self.origin = Origin(start.latitude_deg, start.longitude_deg, start.altitude_amsl_m)
         self.home: Home | None = None
@@ -150,10 +162,18 @@ class Autopilot:
         self._limiter = TextLimiter()
         self._answers = TextLimiter(ANSWERS_HZ, ANSWERS_BURST)
         self._now_us = 0
+        self._watched_us = 0
+        self._news: tuple[object, ...] = ()
+        """What the commander has to look at once it changes."""
+        self._battery_us = 0
+        """When the battery was measured."""
+        self._return_margin_s = inf
+        self._altitude_loss = AltitudeLoss()
         self._shown: tuple[Mode, bool, bool, int] | None = None
         self._gcs_us: int | None = None
         self._links_failed = False
         self._look_us = 0
+        self._commanded_us = 0
         self._housekept_us = -HOUSEKEEPING_US
         self._plan_watch = PlanWatch(shared.plan, self.origin, parameters, lambda text: self.warn("mission", text))
         self._fence_breach: str | None = None
@@ -245,8 +265,16 @@ class Autopilot:
                 self._look_us = now_us
 
     def _on_manual_control(self, message: Message, frame: Frame, now_us: int) -> None:
-        if message.target in (0, self.system_id) and self.failures.of(Unit.RC) is Kind.OK:
-            self.pilot.receive(message, now_us)
+        if message.target not in (0, self.system_id) or self.failures.of(Unit.RC) is not Kind.OK:
+            return
+        if self.parameters["COM_RC_IN_MODE"] in (0, 4):
+            return
+        if self.pilot.receive(message, now_us):
+            if self.pilot.kill_asked(now_us):
+                self.commander.request_kill(True, latch=True)
+            if self.pilot.moved and self._control in (Control.NAVIGATOR, Control.STREAM):
+                self._step_commander(now_us)
+                self.commander.request_takeover()
 
     def _on_set_mode(self, message: Message, frame: Frame, now_us: int) -> None:
         """SET_MODE (11) has no acknowledgement; PX4's main mode is in byte 2, its sub mode in byte 3 of custom_mode."""
@@ -276,6 +304,9 @@ class Autopilot:
         if status is not self._status:
             self._status = status
             self.accuracy = telemetry.accuracy(status)
+            self.valid = Validity(
+                status.attitude_valid, status.height_valid, status.velocity_valid, status.position_valid
+            )
 
     @property
     def at_rest(self) -> bool:
@@ -468,9 +499,15 @@ class Autopilot:
         """With what is known now."""
         self._now_us = now_us
         self._look_us = now_us + LOOK_US
+        elapsed_s = (now_us - self._commanded_us) / 1e6
+        self._commanded_us = now_us
         setpoint_us, sticks_us, gcs_us = self.setpoint_us, self.pilot.received_us, self._gcs_us
         if sticks_us is not None and self.failures.of(Unit.RC) is Kind.STUCK:
             sticks_us = self.pilot.received_us = now_us
+        w, x, y, z = self.estimate[6:10]
+        roll_rad, pitch_rad, _ = to_euler((w, x, y, z))
+        took_off_us, valid, wind = self.flight_times.took_off_us, self.valid, self.wind
+        armed = self.commander.armed
         self.commander.step(
             now_us,
             Situation(
@@ -479,16 +516,60 @@ class Autopilot:
                 None if sticks_us is None else now_us - sticks_us,
                 None if gcs_us is None else now_us - gcs_us,
                 self.mission_refusal,
-                None if self.commander.armed else self._health_refusal,
+                None if armed else self._health_refusal,
                 int(self.battery.level),
                 self._fence_breach,
+                *valid,
+                self._stream_needs,
+                roll_rad,
+                pitch_rad,
+                self._lost_altitude_m(elapsed_s),
+                self.failed_motors,
+                now_us - self._battery_us,
+                self.battery.charge,
+                self._return_margin_s,
+                (now_us - took_off_us) / 1e6 if armed and took_off_us else 0.0,
+                hypot(*wind.velocity_nwu_m_s[:2]) if wind is not None else 0.0,
+                self.accuracy.position_m,
+                self._plan_watch.mission_failure,
+                self.plan.progress.state == MISSION_COMPLETE,
+                self.pilot.axes.throttle,
             ),
+        )
+
+    @property
+    def _stream_needs(self) -> Need:
+        """The estimates without which the newest off-board setpoint cannot be flown."""
+        setpoint = self.setpoint
+        if isinstance(setpoint, PositionSetpoint):
+            return setpoint_needs(setpoint)
+        return Need.ATTITUDE if isinstance(setpoint, AttitudeSetpoint) else Need.NOTHING
+
+    def _lost_altitude_m(self, elapsed_s: float) -> float:
+        if not self.parameters["FD_ALT_LOSS"]:
+            return 0.0
+        target = self.position_setpoint or PositionSetpoint()
+        height_m = self._state().position_nwu_m[2]
+        return self._altitude_loss.update(height_m, target.position_nwu_m[2], target.velocity_nwu_m_s[2], elapsed_s)
+
+    def _state(self) -> State:
+        """The estimate; what is not valid of it is not known."""
+        state, valid = State.of(self.estimate), self.valid
+        if valid == _ALL_VALID:
+            return state
+        (x, y, z), (vx, vy, vz), attitude = state
+        return State(
+            (x if valid.position else nan, y if valid.position else nan, z if valid.height else nan),
+            (vx if valid.velocity else nan, vy if valid.velocity else nan, vz if valid.height else nan),
+            attitude if valid.attitude else (nan, nan, nan, nan),
         )
 
     def decide(self, now_us: int) -> Setpoint | None:
         """Before the physics: step the commander, and the setpoint for the inner loops; None stops the rotors."""
         if now_us - self._housekept_us >= HOUSEKEEPING_US:
             self._keep_house(now_us)
+        if now_us - self._watched_us >= WATCH_US and self.commander.armed:
+            self._watch_plan(now_us)
         if now_us >= self._look_us:
             self._step_commander(now_us)
         commander = self.commander
@@ -503,6 +584,10 @@ class Autopilot:
         elif halted and not self._halted:
             self.navigator.hold()  # on its way somewhere, by DO_REPOSITION
         self._halted = halted
+        if commander.kill_engaged:
+            self._rest()
+            self.attitude_setpoint = None
+            return None
         control = self._control
         if control is Control.STREAM:
             setpoint = self._follow_stream(now_us)
@@ -524,14 +609,14 @@ class Autopilot:
             self._cascade = False
             self.position_setpoint = None
             return setpoint
-        state = State.of(self.estimate)
+        state = self._state()
         if on_ground and not _asks_to_lift(setpoint, state):
             self._rest()
             return None
         return self._fly_position(setpoint, state, inf)
 
     def _navigate(self, now_us: int) -> Setpoint | None:
-        state = State.of(self.estimate)
+        state = self._state()
         on_ground = self.land.on_ground
         if on_ground:
             ready = self.commander.spooled_up(now_us)
@@ -553,7 +638,7 @@ class Autopilot:
             if not (lift and self.commander.spooled_up(now_us)):
                 self._rest()
                 return None
-        state = State.of(self.estimate)
+        state = self._state()
         setpoint = self.pilot.update(mode, state, state.position_nwu_m[2], present=present)
         if isinstance(setpoint, PositionSetpoint):
             return self._fly_position(setpoint, state, inf)
@@ -577,7 +662,7 @@ class Autopilot:
 
     def _switch(self, mode: Mode, now_us: int) -> None:
         """Another mode flies from now on."""
-        state = State.of(self.estimate)
+        state = self._state()
         control = modes.TABLE[mode].control
         if self._flown is None:
             self._arm(now_us)
@@ -609,35 +694,54 @@ class Autopilot:
         self._housekept_us = now_us
         if self.home is None:
             self.set_home_here()
-        self.battery.update(
-            self.body.rotor_speeds_rad_s, self.commander.armed, HOUSEKEEPING_US / 1e6,
-            self.failures.of(Unit.BATTERY), self.failures.value(Unit.BATTERY),
-        )  # fmt: skip
+        slow = self.failures.of(Unit.BATTERY) is Kind.SLOW
+        if now_us - self._battery_us >= (SLOW_BATTERY_US if slow else 0):
+            self.battery.update(
+                self.body.rotor_speeds_rad_s, self.commander.armed,
+                max(now_us - self._battery_us, HOUSEKEEPING_US) / 1e6,
+                self.failures.of(Unit.BATTERY), self.failures.value(Unit.BATTERY),
+            )  # fmt: skip
+            self._battery_us = now_us
         self._refresh_plan()
         x, y, z = self.estimate[:3]
         self._fence_breach = self._plan_watch.breach((x, y, z))
-        mode = modes.TABLE[self.commander.intended]
-        status, sensors = self._status, self._status.sensors
+        needs, valid, sensors = modes.TABLE[self.commander.intended].needs, self.valid, self._status.sensors
         self.health = Health(
             gyro=sensors.gyro,
             accelerometer=sensors.accelerometer,
             magnetometer=sensors.magnetometer,
             barometer=sensors.barometer,
             gps=sensors.gps,
-            attitude=status.attitude_valid,
-            height=status.height_valid,
-            position=status.position_valid,
             battery=self.battery.level < Level.CRITICAL,
             motors=not self.failed_motors,
+            attitude=valid.attitude,
+            height=valid.height or Need.HEIGHT not in needs,
+            position=valid.position and valid.velocity,
             upright=_upright(self.estimate[7], self.estimate[8]),
             home=self.home is not None,
             sticks=self.commander.sticks_fresh(),
             fence=self._plan_watch.fenced,
             fence_breached=self._fence_breach is not None and self._plan_watch.acts,
-            position_needed=mode.control is not Control.STREAM,
+            position_needed=Need.POSITION in needs,
         )
         self._health_refusal = summary(self.health)
         self.health = self.health._replace(mode_refusal=self.commander.mode_refusal())
+
+    def _watch_plan(self, now_us: int) -> None:
+        """What fail-safes must not wait for until the house is kept."""
+        self._watched_us = now_us
+        if self._plan_watch.stale:
+            self._refresh_plan()
+        x, y, z = self.estimate[:3]
+        self._fence_breach = self._plan_watch.breach((x, y, z))
+        remaining_s = self.battery.remaining_s
+        self._return_margin_s = inf
+        if self.parameters["COM_FLTT_LOW_ACT"] > 0 and remaining_s is not None and not self.on_ground:
+            self._return_margin_s = remaining_s - self.navigator.return_time_s(self._state())
+        news = (self.battery.level, self._fence_breach, self._plan_watch.mission_failure, self._return_margin_s <= 0.0)
+        if news != self._news:
+            self._news = news
+            self._look_us = now_us
 
     def _refresh_plan(self) -> None:
         watch = self._plan_watch
@@ -699,6 +803,18 @@ class Autopilot:
 def _upright(x: float, y: float) -> bool:
     """Tilted by less than UPRIGHT_TILT_RAD, by the x and y of the attitude quaternion."""
     return 1.0 - 2.0 * (x * x + y * y) > cos(UPRIGHT_TILT_RAD)
+
+
+def setpoint_needs(setpoint: PositionSetpoint) -> Need:
+    """The estimates without which it cannot be flown."""
+    needs = Need.ATTITUDE
+    x, y, z = setpoint.position_nwu_m
+    vx, vy, vz = setpoint.velocity_nwu_m_s
+    if isfinite(x) or isfinite(y):
+        needs |= Need.POSITION | Need.VELOCITY
+    if isfinite(vx) or isfinite(vy):
+        needs |= Need.VELOCITY
+    return needs | Need.HEIGHT if isfinite(z) or isfinite(vz) else needs
 
 
 def _asks_to_lift(setpoint: PositionSetpoint, state: State) -> bool:

@@ -138,7 +138,7 @@ class Battery:
         failure: Kind = Kind.OK, left: float = 0.0,
     ) -> None:  # fmt: skip
         """Draw the rotors' power and the hotel load for `dt_s`; `left`: the charge of a pack that is WRONG."""
-        if failure is Kind.OK and self._failure is Kind.OK:
+        if failure in (Kind.OK, Kind.SLOW) and self._failure is Kind.OK:
             self._draw(rotor_speeds_rad_s, armed, dt_s)
             return
         if self._failure is Kind.OK:
@@ -150,7 +150,7 @@ class Battery:
         self._true_charge = self.charge
         if failure is Kind.STUCK:
             self.charge, self.voltage_v, self.current_a = shown
-        elif failure is not Kind.OK:
+        elif failure in (Kind.OFF, Kind.WRONG):
             lost_v = open_circuit_v(self.charge)
             self.charge = 0.0 if failure is Kind.OFF else min(left, self.charge)
             self.voltage_v -= self.cells * (lost_v - open_circuit_v(self.charge))

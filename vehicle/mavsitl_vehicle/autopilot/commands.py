@@ -145,8 +145,12 @@ def _set_standard_mode(autopilot: Autopilot, command: Command, now_us: int, port
 
 
 def _terminate(autopilot: Autopilot, command: Command, now_us: int, port: Port) -> int:
-    if not command.params[0] > 0.5:
-        return _deny(autopilot, f"Termination refused: param1 is {command.params[0]:g}, need 1")
+    wanted = command.integer(1)
+    if wanted not in (0, 1, 2):
+        return _deny(autopilot, f"Termination refused: param1 is {command.params[0]:g}, need 0, 1 or 2")
+    if wanted != 1:
+        autopilot.commander.request_kill(wanted == 2)
+        return ACCEPTED
     if not autopilot.commander.armed:
         return _deny(autopilot, "Termination refused: not armed")
     return autopilot.request_mode(Mode.TERMINATION, "termination", now_us)
@@ -429,7 +433,9 @@ TABLE: dict[int, Row] = {
     _M.MAV_CMD_COMPONENT_ARM_DISARM: Row(_arm_disarm, "param2 21196 (PX4) or 2989 forces a disarming, no arming"),
     _M.MAV_CMD_DO_SET_MODE: Row(_set_mode, "one acknowledgement; PX4 sends two"),
     _M.MAV_CMD_DO_SET_STANDARD_MODE: Row(_set_standard_mode, "as AVAILABLE_MODES lists them"),
-    _M.MAV_CMD_DO_FLIGHTTERMINATION: Row(_terminate, "armed only; the rotors stop"),
+    _M.MAV_CMD_DO_FLIGHTTERMINATION: Row(
+        _terminate, "1: armed only, the rotors stop for good; 2, 0: the kill switch on and off, as PX4's lockdown"
+    ),
     _M.MAV_CMD_NAV_TAKEOFF: Row(
         _takeoff,
         "altitude above the sea; COMMAND_LONG: over the ground where that is below; NaN: MIS_TAKEOFF_ALT; 0/0: here",

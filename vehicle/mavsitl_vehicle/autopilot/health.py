@@ -34,6 +34,18 @@ _ALWAYS = (
 """What every vehicle of this kind has."""
 
 
+class Validity(NamedTuple):
+    """Which parts of the estimate are good for flying."""
+
+    attitude: bool = True
+    height: bool = True
+    """Height and climb."""
+    velocity: bool = True
+    """Horizontal."""
+    position: bool = True
+    """Horizontal."""
+
+
 class Health(NamedTuple):
     """What is well. Defaults are a vehicle without faults, sticks, fence or log."""
 

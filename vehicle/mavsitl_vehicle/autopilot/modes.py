@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import Enum, auto
+from enum import Enum, Flag, auto
 from typing import NamedTuple
 
 from mavsitl.dialect import mavlink
@@ -16,6 +16,7 @@ class Mode(Enum):
     LOITER = auto()
     RTL = auto()
     ACRO = auto()
+    DESCEND = auto()
     TERMINATION = auto()
     OFFBOARD = auto()
     STABILIZED = auto()
@@ -37,6 +38,25 @@ class Control(Enum):
     """The rotors stand still."""
 
 
+class Need(Flag):
+    """What must be there for a mode to be flown."""
+
+    NOTHING = 0
+    ATTITUDE = auto()
+    HEIGHT = auto()
+    VELOCITY = auto()
+    POSITION = auto()
+    """These four: valid estimates."""
+    HOME = auto()
+    MISSION = auto()
+    """One that can be flown."""
+    STREAM = auto()
+    """Setpoints of an off-board program, and the estimates that they themselves need."""
+    STICKS = auto()
+    LIMITS = auto()
+    """Wind and flight time within COM_WIND_MAX and COM_FLT_TIME_MAX: for the choice of the mode, not while it flies."""
+
+
 class ModeInfo(NamedTuple):
     """PX4's numbers and rules of one mode."""
 
@@ -51,6 +71,8 @@ class ModeInfo(NamedTuple):
     control: Control
     standard_mode: int
     """MAV_STANDARD_MODE"""
+    needs: Need
+    """PX4's mode requirements."""
     stabilized: bool
     """An attitude loop runs: MAV_MODE_FLAG_STABILIZE_ENABLED."""
     can_arm: bool
@@ -72,32 +94,50 @@ class ModeInfo(NamedTuple):
 
 
 def _row(
-    name: str, title: str, numbers: tuple[int, int, int], control: Control, *, standard: int = 0, can_arm: bool = True,
-    stabilized: bool = True, selectable: bool = True, advanced: bool = True,
+    name: str, title: str, numbers: tuple[int, int, int], control: Control, needs: Need, *, standard: int = 0,
+    can_arm: bool = True, stabilized: bool = True, selectable: bool = True, advanced: bool = True,
 ) -> ModeInfo:  # fmt: skip
-    return ModeInfo(name, title, *numbers, control, standard, stabilized, can_arm, selectable, advanced)
+    return ModeInfo(name, title, *numbers, control, standard, needs, stabilized, can_arm, selectable, advanced)
 
 
 _STICKS, _AUTO = Control.STICKS, Control.NAVIGATOR
+_LEVEL = Need.ATTITUDE
+_WHERE = Need.ATTITUDE | Need.HEIGHT | Need.VELOCITY | Need.POSITION
 
 TABLE: dict[Mode, ModeInfo] = {
-    Mode.MANUAL: _row("MANUAL", "Manual", (1, 0, 0), _STICKS),
-    Mode.ALTCTL: _row("ALTCTL", "Altitude", (2, 0, 1), _STICKS, standard=4, advanced=False),
-    Mode.POSCTL: _row("POSCTL", "Position", (3, 0, 2), _STICKS, standard=1, advanced=False),
-    Mode.MISSION: _row("AUTO.MISSION", "Mission", (4, 4, 3), _AUTO, standard=6, advanced=False),
-    Mode.LOITER: _row("AUTO.LOITER", "Hold", (4, 3, 4), _AUTO, advanced=False),
-    Mode.RTL: _row("AUTO.RTL", "Return", (4, 5, 5), _AUTO, standard=5, can_arm=False, advanced=False),
-    Mode.ACRO: _row("ACRO", "Acro", (5, 0, 10), _STICKS, stabilized=False),
-    Mode.TERMINATION: _row(
-        "TERMINATION", "Termination", (10, 0, 13), Control.NOBODY, can_arm=False, stabilized=False, selectable=False
+    Mode.MANUAL: _row("MANUAL", "Manual", (1, 0, 0), _STICKS, _LEVEL | Need.STICKS),
+    Mode.ALTCTL: _row(
+        "ALTCTL", "Altitude", (2, 0, 1), _STICKS, _LEVEL | Need.HEIGHT | Need.STICKS, standard=4, advanced=False
     ),
-    Mode.OFFBOARD: _row("OFFBOARD", "Offboard", (6, 0, 14), Control.STREAM),
-    Mode.STABILIZED: _row("STABILIZED", "Stabilized", (7, 0, 15), _STICKS),
-    Mode.TAKEOFF: _row("AUTO.TAKEOFF", "Takeoff", (4, 2, 17), _AUTO, standard=8, advanced=False),
-    Mode.LAND: _row("AUTO.LAND", "Land", (4, 6, 18), _AUTO, standard=7, can_arm=False, advanced=False),
-    Mode.ORBIT: _row("ORBIT", "Orbit", (3, 1, 21), _AUTO, standard=2, can_arm=False, selectable=False, advanced=False),
-}
-"""In the order of PX4's nav_state, which is the order of AVAILABLE_MODES."""
+    Mode.POSCTL: _row("POSCTL", "Position", (3, 0, 2), _STICKS, _WHERE | Need.STICKS, standard=1, advanced=False),
+    Mode.MISSION: _row(
+        "AUTO.MISSION", "Mission", (4, 4, 3), _AUTO, _WHERE | Need.MISSION | Need.LIMITS, standard=6, advanced=False
+    ),
+    Mode.LOITER: _row("AUTO.LOITER", "Hold", (4, 3, 4), _AUTO, _WHERE | Need.LIMITS, advanced=False),
+    Mode.RTL: _row(
+        "AUTO.RTL", "Return", (4, 5, 5), _AUTO, _WHERE | Need.HOME, standard=5, can_arm=False, advanced=False
+    ),
+    Mode.ACRO: _row("ACRO", "Acro", (5, 0, 10), _STICKS, Need.STICKS, stabilized=False),
+    Mode.DESCEND: _row(
+        "AUTO.DESCEND", "Descend", (4, 6, 12), _AUTO, _LEVEL, can_arm=False, selectable=False, advanced=False
+    ),
+    Mode.TERMINATION: _row(
+        "TERMINATION", "Termination", (10, 0, 13), Control.NOBODY, Need.NOTHING,
+        can_arm=False, stabilized=False, selectable=False,
+    ),
+    Mode.OFFBOARD: _row("OFFBOARD", "Offboard", (6, 0, 14), Control.STREAM, _LEVEL | Need.STREAM),
+    Mode.STABILIZED: _row("STABILIZED", "Stabilized", (7, 0, 15), _STICKS, _LEVEL | Need.STICKS),
+    Mode.TAKEOFF: _row("AUTO.TAKEOFF", "Takeoff", (4, 2, 17), _AUTO, _WHERE, standard=8, advanced=False),
+    Mode.LAND: _row("AUTO.LAND", "Land", (4, 6, 18), _AUTO, _WHERE, standard=7, can_arm=False, advanced=False),
+    Mode.ORBIT: _row(
+        "ORBIT", "Orbit", (3, 1, 21), _AUTO, _WHERE | Need.LIMITS,
+        standard=2, can_arm=False, selectable=False, advanced=False,
+    ),
+}  # fmt: skip
+"""In the order of PX4's nav_state, which is the order of AVAILABLE_MODES. PX4 shows DESCEND by AUTO.LAND's numbers."""
+
+LISTED = tuple(mode for mode in TABLE if mode is not Mode.DESCEND)
+"""In AVAILABLE_MODES, where numbers name one mode each."""
 
 _SELECTABLE = {mode: info for mode, info in TABLE.items() if info.selectable}
 _BY_NUMBERS = {(info.main_mode, info.sub_mode): mode for mode, info in _SELECTABLE.items()}

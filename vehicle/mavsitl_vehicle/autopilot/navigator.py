@@ -26,6 +26,8 @@ MIN_TAKEOFF_HEIGHT_M = 0.5
 DEFAULT_ORBIT_RADIUS_M, DEFAULT_ORBIT_SPEED_M_S = 10.0, 2.0
 ORBIT_ACCELERATION_M_S2 = 3.0
 """Largest centripetal acceleration of an orbit."""
+BLIND_DESCENT_M_S2 = 0.3
+"""Less acceleration than hovering takes: the descent where not even the height is known, as PX4's."""
 ORBIT_GAIN_PER_S = 0.5
 """Distance from the circle to the speed back to it."""
 
@@ -37,6 +39,7 @@ class Task(Enum):
     TAKEOFF = auto()
     GO = auto()
     DESCEND = auto()
+    SINK = auto()
     ORBIT = auto()
     RETURN = auto()
 
@@ -176,7 +179,7 @@ class Navigator:
         if mode is not Mode.TAKEOFF:
             self._takeoff_height = self._takeoff_yaw_rad = None
             self._takeoff_asked = False
-        if mode in (Mode.TAKEOFF, Mode.RTL, Mode.LAND):
+        if mode in (Mode.TAKEOFF, Mode.RTL, Mode.LAND, Mode.DESCEND):
             self._forget_speeds()
         if arrived:
             self._stay_up()
@@ -194,6 +197,9 @@ class Navigator:
                 self._fly_to(*self._pending_go)
         elif mode is Mode.LAND:
             self.descend()
+        elif mode is Mode.DESCEND:
+            self._task = Task.SINK
+            self.landing = True
         elif mode is Mode.RTL:
             self.begin_return(state)
         elif mode is Mode.ORBIT:
@@ -240,6 +246,8 @@ class Navigator:
         elif self._mode is Mode.ORBIT and self._pending_orbit is not None:
             self._begin_orbit(state)
             self._pending_orbit = None
+        if self._task is Task.SINK:
+            return self._sinking(state), inf
         if self._task is Task.ORBIT:
             self._circle(state)
         elif self._task is Task.DESCEND:
@@ -356,19 +364,51 @@ class Navigator:
         """DO_CHANGE_SPEED holds for what is flown until somebody else flies, or another flight, a return begins."""
         self._speed = self._climb = self._sink = nan
 
+    def _sinking(self, state: State) -> PositionSetpoint:
+        """Level, wherever the wind takes it; downwards by the height, or without one by less thrust than it hovers."""
+        if not isfinite(state.velocity_nwu_m_s[2]):
+            return PositionSetpoint(acceleration_nwu_m_s2=(0.0, 0.0, -BLIND_DESCENT_M_S2))
+        self._motion.climb(-landing_speed(state.position_nwu_m[2] - self._ground_under(), self._parameters))
+        motion = self._motion.update(state.position_nwu_m)
+        return PositionSetpoint(
+            (nan, nan, motion.position_nwu_m[2]), (nan, nan, motion.velocity_nwu_m_s[2]),
+            (0.0, 0.0, motion.acceleration_nwu_m_s2[2]), motion.yaw_rad, motion.yaw_rate_rad_s,
+        )  # fmt: skip
+
     def begin_return(self, state: State) -> None:
         """Climb to RTL_RETURN_ALT, go to home or the nearest rally point, sink to RTL_DESCEND_ALT, wait, land."""
         home = self.home
         if home is None:
             self.descend()
             return
-        x, y, z = state.position_nwu_m
-        places = ((home.position_nwu_m, home.yaw_rad), *((rally, nan) for rally in self.rally_nwu_m))
-        (px, py, least), self._return_yaw_rad = min(places, key=lambda place: hypot(x - place[0][0], y - place[0][1]))
-        self._return_xy_m = px, py
-        height = max(home.position_nwu_m[2] + self._return_height(hypot(x - px, y - py)), least, z)
+        self._return_xy_m, self._return_yaw_rad, height = self._way_back(home, state)
         self._return = ReturnPhase.CLIMB
         self._return_by((nan, nan, height))
+
+    def return_time_s(self, state: State) -> float:
+        """Of a return from here to the ground, at the parameters' speeds; 0 without a home.
+
+        As PX4 counts it: RTL_TIME_FACTOR times the way, and RTL_TIME_MARGIN.
+        """
+        home, p = self.home, self._parameters
+        if home is None:
+            return 0.0
+        (px, py), _, height = self._way_back(home, state)
+        x, y, z = state.position_nwu_m
+        lower = min(height, home.position_nwu_m[2] + p["RTL_DESCEND_ALT"])
+        way_s = (height - z) / p["MPC_Z_V_AUTO_UP"]
+        way_s += hypot(x - px, y - py) / min(p["MPC_XY_CRUISE"], p["MPC_XY_VEL_MAX"])
+        way_s += (height - lower) / p["MPC_Z_V_AUTO_DN"] + max(p["RTL_LAND_DELAY"], 0.0)
+        way_s += max(lower - self._ground_under(), 0.0) / p["MPC_LAND_SPEED"]
+        return p["RTL_TIME_FACTOR"] * way_s + p["RTL_TIME_MARGIN"]
+
+    def _way_back(self, home: Home, state: State) -> tuple[tuple[float, float], float, float]:
+        """Where a return from here ends (north, west), with which yaw, and the height of the way there."""
+        x, y, z = state.position_nwu_m
+        places = ((home.position_nwu_m, home.yaw_rad), *((rally, nan) for rally in self.rally_nwu_m))
+        (px, py, least), yaw_rad = min(places, key=lambda place: hypot(x - place[0][0], y - place[0][1]))
+        height = max(home.position_nwu_m[2] + self._return_height(hypot(x - px, y - py)), least, z)
+        return (px, py), yaw_rad, height
 
     def _return_height(self, away_m: float) -> float:
         """Above home: RTL_RETURN_ALT; nearer than RTL_MIN_DIST no more than the cone of RTL_CONE_ANG asks for."""

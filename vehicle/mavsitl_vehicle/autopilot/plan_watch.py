@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from mavsitl.frames import Vector
 from mavsitl.geodesy import Origin
 from mavsitl.services.mission import FENCE, MISSION, RALLY
 from mavsitl_vehicle.autopilot.fence import NO_LIMITS, Fence, FenceLimits
-from mavsitl_vehicle.autopilot.plan import FeasibilityContext, Home, VehiclePlan
+from mavsitl_vehicle.autopilot.plan import FeasibilityContext, Finding, Home, VehiclePlan
 from mavsitl_vehicle.autopilot.position import Values
 
 MAX_TOLD = 3
@@ -20,12 +20,14 @@ class PlanWatch:
 
     Attributes:
         mission_refusal: why AUTO.MISSION would not fly; None when it would.
+        mission_failure: the same without fence and limits, which have a fail-safe of their own.
         rally_nwu_m: the rally points.
     """
 
     def __init__(self, plan: VehiclePlan, origin: Origin, parameters: Values, tell: Callable[[str], None]) -> None:
         """`tell` gets what is wrong, or looks wrong, with a mission that has just come."""
         self.mission_refusal: str | None = "no mission"
+        self.mission_failure: str | None = "no mission"
         self.rally_nwu_m: tuple[Vector, ...] = ()
         self._plan = plan
         self._origin = origin
@@ -106,8 +108,14 @@ class PlanWatch:
             p["MIS_DIST_1WP"], int(p["MIS_TKO_LAND_REQ"]), p["MIS_TAKEOFF_ALT"],
         )  # fmt: skip
         findings = self._plan.feasibility(context)
-        self.mission_refusal = next((finding.text for finding in findings if finding.fatal), None)
+        self.mission_refusal = self.mission_failure = _first_fatal(findings)
+        if self.mission_refusal is not None:
+            self.mission_failure = _first_fatal(self._plan.feasibility(context._replace(fence=None, limits=NO_LIMITS)))
         if stores.items(MISSION) and stores.id(MISSION) != self._mission_told:
             self._mission_told = stores.id(MISSION)
             for finding in findings[:MAX_TOLD]:
                 self._tell(f"Mission: {finding.text}")
+
+
+def _first_fatal(findings: Iterable[Finding]) -> str | None:
+    return next((finding.text for finding in findings if finding.fatal), None)

@@ -357,13 +357,14 @@ _AVAILABLE_MODES = _pack("available_modes")
 
 def _mode_rows() -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = []
-    for index, (mode, info) in enumerate(modes.TABLE.items(), 1):
+    for index, mode in enumerate(modes.LISTED, 1):
+        info = modes.TABLE[mode]
         properties = mavlink.MAV_MODE_PROPERTY_ADVANCED if info.advanced else 0
         if not info.selectable:
             properties |= mavlink.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE
         # A standard mode has its name from the standard.
         title = b"" if info.standard_mode else info.title.encode()
-        rows.append((len(modes.TABLE), index, info.standard_mode, modes.custom_mode(mode), properties, title))
+        rows.append((len(modes.LISTED), index, info.standard_mode, modes.custom_mode(mode), properties, title))
     return rows
 
 
