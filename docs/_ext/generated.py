@@ -13,6 +13,8 @@
 ``{modes}``, ``{mode-changes}``, ``{failsafes}``
     The flight modes with PX4's numbers; a drawing of the changes that nobody asked for, found by running the commander;
     what trips each fail-safe and what it does by the value of its parameter.
+``{failures}``
+    `failures.TABLE`: what each failure that can be injected does, its size, and the parameters that show and set it.
 ``{parameter-tables}``
     A section for each group of the vehicle's parameters: name, type, default, allowed values, meaning.
 ``{chaos-modes}``
@@ -36,6 +38,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 from docutils import nodes
+from mavsitl_vehicle import failures
 from mavsitl_vehicle.autopilot import commands, modes, plan, telemetry
 from mavsitl_vehicle.autopilot.commander import FAILSAFES, Action, By, Commander, Failsafe, Situation
 from mavsitl_vehicle.autopilot.modes import Control, Mode, Need
@@ -625,6 +628,31 @@ class ChaosModes(GeneratedDirective):
         return self.section(group, self.table(("mode", "what goes wrong", "defaults", "MockLink's name"), rows))
 
 
+class FailureTable(GeneratedDirective):
+    """`failures.TABLE`."""
+
+    def run(self) -> list[nodes.Node]:
+        rows = []
+        for (unit, kind), meaning in sorted(failures.TABLE.items()):
+            size = failures.SIZES.get((unit, kind))
+            names = [name for name, (other, _) in failures.PARAMETERS.items() if other is unit]
+            shown = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+            rows.append(
+                [
+                    self.text(f"`{failures.named(unit)}` ({unit.value})"),
+                    self.text(f"`{failures.named(kind)}` ({kind.value})"),
+                    self.text(meaning),
+                    self.text(size_text(size) if size else ""),
+                    self.code(shown),
+                ]
+            )
+        return [self.table(("unit", "type", "what it does", "value", "parameters"), rows)]
+
+
+def size_text(size: failures.Size) -> str:
+    return f"{size.minimum:g} to {size.maximum:g}; without one {size.default:g}: {size.text(size.default)}"
+
+
 class CliHelp(GeneratedDirective):
     optional_arguments = 1
 
@@ -654,6 +682,7 @@ def setup(app: Sphinx) -> ExtensionMetadata:
     app.add_directive("modes", Modes)
     app.add_directive("mode-changes", ModeChanges)
     app.add_directive("failsafes", Failsafes)
+    app.add_directive("failures", FailureTable)
     app.add_directive("parameter-tables", ParameterTables)
     app.add_directive("chaos-modes", ChaosModes)
     app.add_directive("cli-help", CliHelp)

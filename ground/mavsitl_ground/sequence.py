@@ -1,8 +1,8 @@
 """The handshake that brings a vehicle into OFFBOARD and back: one table of phases, stepped with the time.
 
 SEARCH -> CONNECT -> STREAM -> OFFBOARD -> ARM -> RELEASE -> FLY -> STOP -> DONE; a silent or restarted vehicle leads
-back to SEARCH from anywhere, a vehicle that somebody else disarmed in flight to ABORTED, one that has crashed by STOP
-to LOST.
+back to SEARCH from anywhere, a vehicle that somebody else disarmed in flight to ABORTED, one that has crashed to LOST
+by way of STOP.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from math import inf
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mavsitl import frames
+from mavsitl.dialect import mavlink
 from mavsitl.log import topics
 from mavsitl.log.topics import Topic
 from mavsitl.log.ulog import MemoryRecorder, read
@@ -38,6 +40,28 @@ class LinkStatistics:
     """(k,)"""
     state_age_ms: Array
     """(k,)"""
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A failure while it lasted, on the flight's clock; one from before the flight has begun before 0."""
+
+    what: str
+    """E.g. ``motor 3 wrong (0.8)``."""
+    start_s: float
+    end_s: float
+    """Infinite: it stayed."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """What flew from `time_s` on, on the flight's clock."""
+
+    time_s: float
+    armed: bool
+    nav_state: int
+    """PX4's."""
+    failsafe: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +114,10 @@ class FlightData:
     """Share of the samples with a rotor at its limit, 0 to 1."""
     channels: Mapping[str, ChannelLog] = field(default_factory=dict)
     """The off-board link's directions, "to_ground" and "to_vehicle", where it was impaired."""
+    broken: tuple[Broken, ...] = ()
+    """Failures that were injected, by their beginning."""
+    statuses: tuple[Status, ...] = ()
+    """The one at the release and each later one."""
 
     @classmethod
     def from_recorders(
@@ -154,6 +182,8 @@ class FlightData:
             link=None if link is None else LinkStatistics(link[:, 0], link[:, 1], link[:, 2], link[:, 3] * 1e-3),
             saturated_share=None if saturated is None else _share(saturated[:, 0]),
             channels=_channels(vehicle, release_us, int(stamps[-1])),
+            broken=_broken(vehicle, release_us),
+            statuses=_statuses(vehicle, release_us),
         )
 
     @property
@@ -183,6 +213,47 @@ def _release_us(vehicle: Tables) -> int:
     if not airborne.size:
         raise FlightError(f"the vehicle was never released: no {topics.LAND_DETECTED.name} with landed = 0")
     return int(table["timestamp"][airborne[0]])
+
+
+def _broken(vehicle: Tables, release_us: int) -> tuple[Broken, ...]:
+    table = vehicle.get(topics.INJECTED_FAILURE.name)
+    if table is None:
+        return ()
+    running: dict[tuple[int, int], Broken] = {}
+    found: list[Broken] = []
+    columns = (table[name].tolist() for name in ("timestamp", "unit", "instance", "type", "value"))
+    for stamp_us, unit, instance, kind, value in zip(*columns, strict=True):
+        time_s = (stamp_us - release_us) * 1e-6
+        if before := running.pop((unit, instance), None):
+            found[found.index(before)] = replace(before, end_s=time_s)
+        if kind != mavlink.FAILURE_TYPE_OK:
+            size = f" ({value:g})" if value == value else ""
+            what = f"{_spoken('FAILURE_UNIT', unit)} {instance} {_spoken('FAILURE_TYPE', kind)}{size}"
+            running[unit, instance] = Broken(what, time_s, inf)
+            found.append(running[unit, instance])
+    return tuple(found)
+
+
+def _spoken(enum: str, value: int) -> str:
+    """``motor`` for FAILURE_UNIT_SYSTEM_MOTOR."""
+    entry = mavlink.enums[enum].get(value)
+    if entry is None:
+        return f"{enum} {value}"
+    name: str = entry.name.removeprefix(f"{enum}_").removeprefix("SENSOR_").removeprefix("SYSTEM_")
+    return name.removesuffix("_SIGNAL").lower()
+
+
+def _statuses(vehicle: Tables, release_us: int) -> tuple[Status, ...]:
+    table = vehicle.get(topics.VEHICLE_STATUS.name)
+    if table is None:
+        return ()
+    columns = (table[name].tolist() for name in ("timestamp", "arming_state", "nav_state", "failsafe"))
+    rows = [
+        Status((stamp_us - release_us) * 1e-6, state == topics.ARMED, nav_state, bool(failsafe))
+        for stamp_us, state, nav_state, failsafe in zip(*columns, strict=True)
+    ]
+    first = sum(row.time_s <= 0.0 for row in rows)
+    return tuple(rows[max(first - 1, 0) :])
 
 
 def _held(tables: Tables, topic: Topic, stamps: npt.NDArray[Any], columns: tuple[str, ...]) -> Any:

@@ -125,6 +125,8 @@ ACTUATOR_MOTORS = Topic("actuator_motors", ("float[4] control",))
 ROTOR_STATUS = Topic("rotor_status", ("float[4] speed_rad_s", "uint8_t saturated"))
 RATES_SETPOINT = Topic("vehicle_rates_setpoint", ("float roll", "float pitch", "float yaw", "float[3] thrust_body"))
 VEHICLE_STATUS = Topic("vehicle_status", ("uint8_t arming_state", "uint8_t nav_state", "uint8_t failsafe"))
+DISARMED, ARMED = 1, 2
+"""Of arming_state."""
 LAND_DETECTED = Topic("vehicle_land_detected", ("uint8_t landed", "uint8_t ground_contact"))
 """Written at every change; the first row with landed = 0 is the release."""
 INJECTED_FAILURE = Topic("injected_failure", ("uint8_t unit", "uint8_t instance", "uint8_t type", "float value"))

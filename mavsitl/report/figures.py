@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from mavsitl.log.flight import Array, FlightData
+from mavsitl.log.flight import Array, Broken, FlightData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +24,7 @@ CALM = "#2166ac"
 WIND = "#d6604d"
 REFERENCE = "#1b1b1f"
 UNDERNEATH = "#a9abb8"
+BROKEN = "#a3241b"
 _TERMS = ("#2166ac", "#d6604d", "#1b7837")
 _WIDTH_IN = 9.0
 _HALF_WIDTH_IN = 5.8
@@ -82,6 +83,7 @@ def wind(flight: FlightData, counterpart: str) -> Drawing:
         for axes, axis, name in zip(_grid(figure, 3, 1).flat, range(3), "uvw", strict=True):
             _line(axes, flight.time_s, flight.wind_nwu_m_s[:, axis], WIND)
             axes.set_ylabel(f"{name} / (m/s)")
+            _mark([axes], flight)
 
     return Drawing(_svg(draw, 4.2, "wind"), "Wind along x, y and z at the vehicle", counterpart)
 
@@ -123,6 +125,9 @@ def path_3d(flights: Flights, counterpart: str) -> Drawing:
         axes: Any = figure.add_axes((0.12, 0.0, 0.76, 0.98), projection="3d", computed_zorder=False)
         for label, colour, flight in flights:
             axes.plot(*_track(flight.position_nwu_m), color=colour, label=label, linewidth=1.2, zorder=2)
+            for broken in _during(flight):
+                row = min(int(np.searchsorted(flight.time_s, broken.start_s)), flight.time_s.size - 1)
+                axes.plot(*flight.position_nwu_m[row], marker="X", color=BROKEN, zorder=4)
         axes.plot(
             *_track(flights[0][2].position_reference_nwu_m),
             color=REFERENCE,
@@ -157,6 +162,7 @@ def attitude(flight: FlightData, colour: str, air: str, counterpart: str) -> Dra
             _line(right, flight.time_s, error[:, row], colour)
             left.set_ylabel(f"{name} / °")
             right.set_ylabel(f"{name} error / °")
+            _mark((left, right), flight)
         _time_axis(grid[2], flight.time_s)
         _legend(figure, grid[0][0])
 
@@ -181,6 +187,7 @@ def weights(flight: FlightData, air: str) -> Drawing | None:
             for term, colour in enumerate(_TERMS):
                 _line(axes, flight.time_s, ratio[:, net, term], colour, label="PID"[term])
             axes.set_title(("roll", "pitch", "yaw")[net], fontsize=10, color="#26262b")
+        _mark(columns, flight)
         columns[0].set_ylabel("weight / initial weight")
         _time_axis(columns, flight.time_s)
         _legend(figure, columns[0])
@@ -219,6 +226,7 @@ def link(flight: FlightData, colour: str, air: str) -> Drawing | None:
         right.set_ylabel("frames")
         right.set_ylim(bottom=0.0)
         right.yaxis.get_major_locator().set_params(integer=True)
+        _mark((left, right), flight)
         _time_axis((left, right), flight.time_s)
         _legend(figure, right)
 
@@ -260,6 +268,7 @@ def _four(flight: FlightData, values: Array, colour: str, labels: list[str], *, 
         for axes, column, label in zip(grid.flat, range(4), labels, strict=True):
             _line(axes, flight.time_s, values[:, column], colour, width=0.7)
             axes.set_ylabel(label)
+        _mark(grid.flat, flight)
         _time_axis(grid[1], flight.time_s)
 
     return _svg(draw, 3.7, name, _HALF_WIDTH_IN)
@@ -322,6 +331,20 @@ def _line(
     _time_axis([axes], time)
 
 
+def _during(flight: FlightData) -> list[Broken]:
+    """The failures of some part of the flight."""
+    return [each for each in flight.broken if each.start_s <= flight.time_s[-1] and each.end_s > 0.0]
+
+
+def _mark(row: Iterable[Any], flight: FlightData) -> None:
+    """Shade the time in which something is broken, with a line where it began."""
+    for axes in row:
+        for broken in _during(flight):
+            start_s, end_s = max(broken.start_s, 0.0), min(broken.end_s, float(flight.time_s[-1]))
+            axes.axvspan(start_s, end_s, color=BROKEN, alpha=0.08, linewidth=0.0)
+            axes.axvline(start_s, color=BROKEN, linewidth=0.9, linestyle=(0, (2, 2)))
+
+
 def _time_axis(row: Sequence[Any], time: Array) -> None:
     for axes in row:
         axes.set_xlim(time[0], max(time[-1], time[0] + 1e-3))
@@ -332,6 +355,7 @@ def _time_axis(row: Sequence[Any], time: Array) -> None:
 def _axis_against_reference(axes: Axes, flights: Flights, axis: int) -> None:
     for label, colour, flight in flights:
         _line(axes, flight.time_s, flight.position_nwu_m[:, axis], colour, label=label)
+        _mark([axes], flight)
     longest = max((flight for _, _, flight in flights), key=lambda flight: flight.time_s[-1])
     _line(axes, longest.time_s, longest.position_reference_nwu_m[:, axis], REFERENCE, label="reference", dashed=True)
 

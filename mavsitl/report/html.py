@@ -20,6 +20,12 @@ REPORT_FILE = "report.html"
 
 # Counterparts in the paper, by path: (figure of calm air, figure of wind) or one for both.
 _PAIRS = {"hover": "Set-point hover", "spiral": "Path following: spiral"}
+_MODES = {
+    0: "MANUAL", 1: "ALTCTL", 2: "POSCTL", 3: "AUTO.MISSION", 4: "AUTO.LOITER", 5: "AUTO.RTL", 10: "ACRO",
+    12: "DESCEND", 13: "TERMINATION", 14: "OFFBOARD", 15: "STABILIZED", 17: "AUTO.TAKEOFF", 18: "AUTO.LAND",
+    21: "ORBIT",
+}  # fmt: skip
+"""PX4's vehicle_status.nav_state."""
 _ATTITUDE = {"hover": ("Fig. 9", "Fig. 10"), "spiral": ("Fig. 13", "Fig. 14")}
 
 
@@ -54,6 +60,33 @@ class Shown:
     def links(self) -> list[tables.LinkRow]:
         """Of the impaired links; empty where none was."""
         return tables.link_rows(self.record.links)
+
+    @property
+    def broken(self) -> list[str]:
+        """Each failure and when, and what the flight did from the first on; empty where nothing failed."""
+        data = self.data
+        during = [each for each in data.broken if each.start_s <= data.time_s[-1]]
+        if not during:
+            return []
+        lines = [
+            f"{each.what} from {each.start_s:.1f} s on"
+            if each.end_s > data.time_s[-1]
+            else f"{each.what} from {each.start_s:.1f} s to {each.end_s:.1f} s"
+            for each in during
+        ]
+        since = metrics.aftermath(data, during[0].start_s)
+        lines.append(
+            f"position error at most {since.position_m:.2f} m, altitude lost {since.altitude_m:.2f} m, "
+            f"tilt at most {since.tilt_deg:.0f}°, yaw rate at most {since.yaw_rate_deg_s:.0f}°/s"
+        )
+        lines += [
+            f"{_MODES.get(status.nav_state, f'nav_state {status.nav_state}')}"
+            f"{', fail-safe' if status.failsafe else ''}{'' if status.armed else ', disarmed'}"
+            f" at {status.time_s:.1f} s"
+            for status in data.statuses
+            if status.time_s > during[0].start_s
+        ]
+        return lines
 
     @property
     def cut_short(self) -> bool:

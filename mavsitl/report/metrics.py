@@ -60,9 +60,40 @@ def maximum_error(flight: FlightData) -> MaximumError:
     return MaximumError(*map(float, position), *map(float, attitude))
 
 
+@dataclass(frozen=True)
+class Aftermath:
+    """The worst of a flight from some moment on."""
+
+    position_m: float
+    """Largest distance from the reference."""
+    altitude_m: float
+    """Largest height below the reference."""
+    tilt_deg: float
+    yaw_rate_deg_s: float
+    """Largest, of the heading, by its change over a tenth of a second."""
+
+
+def aftermath(flight: FlightData, from_s: float) -> Aftermath:
+    """From `from_s` on, which is within the flight."""
+    rows = flight.time_s >= from_s
+    error = flight.position_error_nwu_m()[rows]
+    angles = np.radians(flight.attitude_deg[rows])
+    tilt = np.degrees(np.arccos(np.clip(np.cos(angles[:, 0]) * np.cos(angles[:, 1]), -1.0, 1.0)))
+    time_s, heading = flight.time_s[rows], np.unwrap(angles[:, 2])
+    later = np.minimum(np.searchsorted(time_s, time_s + 0.1 - 1e-9), time_s.size - 1)
+    span_s = time_s[later] - time_s
+    turning = np.degrees(np.abs(heading[later] - heading))[span_s > 0.05] / span_s[span_s > 0.05]
+    return Aftermath(
+        position_m=float(np.max(np.linalg.norm(error, axis=1))),
+        altitude_m=float(np.max(-error[:, 2])),
+        tilt_deg=float(np.max(tilt)),
+        yaw_rate_deg_s=float(np.max(turning, initial=0.0)),
+    )
+
+
 def paper_case(scenario: Scenario) -> str | None:
     """The part of Tables 3 and 4 that a scenario answers to, by path, start, air and duration; else None."""
-    if scenario.duration_s != 60.0:
+    if scenario.duration_s != 60.0 or scenario.failures:
         return None
     if scenario.reference == Hover() and scenario.start.position_nwu_m == (0.0, 0.0, 1.0):
         path = "hover"

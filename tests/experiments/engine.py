@@ -10,12 +10,12 @@ import argparse
 import hashlib
 import multiprocessing
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -27,6 +27,8 @@ from mavsitl.scenario import Flight, Waypoints, load
 from tests.experiments.sums import LOST_M, Six, Sums
 
 Overrides = dict[str, Any]
+S = TypeVar("S")
+T = TypeVar("T")
 DEFAULT_STORE = Path("runs") / "experiments.jsonl"
 GRACE_S = 120.0
 """Simulated time beside the flight itself: handshake, take-off, landing."""
@@ -180,6 +182,8 @@ def fly(job: Job) -> Outcome:
     sums.collect()
     if sums.lost_s is not None:
         return outcome("lost", f"more than {LOST_M:g} m from its reference at {sums.lost_s:g} s")
+    if ground.lost:
+        return outcome("lost", ground.lost)
     if not ground.succeeded or not sums.samples:
         return outcome("failed", f"{ground.phase}: {said[-1] if said else 'nothing was said'}")
     return outcome("flown")
@@ -232,25 +236,48 @@ def campaign(jobs: Sequence[Job], *, workers: int, store: Path | None, title: st
     with Progress(*columns, text, console=Console(stderr=True), disable=not show) as bar:
         task = bar.add_task(title, total=len(jobs), completed=len(jobs) - len(missing), said="")
         bad = 0
-        for outcome in _flown(list(missing.values()), workers):
+        for outcome in _flown(list(missing.values()), workers, fly):
             kept.add(outcome)
             bad += not outcome.flown
             bar.update(task, advance=1, said=f"{bad} lost or failed" if bad else "")
     return [kept.outcomes[each.key] for each in jobs]
 
 
-def _flown(jobs: Sequence[Job], workers: int) -> Iterable[Outcome]:
+def flown(jobs: Sequence[Job], workers: int, function: Callable[[Job], T], *, title: str) -> list[T]:
+    """What `function` makes of each job, in their order, with a progress bar on stderr. What it raises is raised."""
+    from rich.console import Console
+    from rich.progress import track
+
+    results = _flown([(index, job) for index, job in enumerate(jobs)], workers, _Numbered(function))
+    return [made for _, made in sorted(track(results, title, len(jobs), console=Console(stderr=True)), key=_first)]
+
+
+def _first(numbered: tuple[int, Any]) -> int:
+    return numbered[0]
+
+
+class _Numbered:
+    """A function of a job with its number."""
+
+    def __init__(self, function: Callable[[Job], Any]) -> None:
+        self._function = function
+
+    def __call__(self, numbered: tuple[int, Job]) -> tuple[int, Any]:
+        return numbered[0], self._function(numbered[1])
+
+
+def _flown(jobs: Sequence[S], workers: int, function: Callable[[S], T]) -> Iterable[T]:
     """As they come. With a pool, never more than a few are queued, so that an interruption ends soon."""
     if workers <= 1 or len(jobs) <= 1:
-        yield from map(fly, jobs)
+        yield from map(function, jobs)
         return
     remaining = iter(jobs)
     context = multiprocessing.get_context("spawn")  # a fork would copy numba's and rich's threads in mid-air
     with ProcessPoolExecutor(max_workers=workers, mp_context=context) as pool:
-        running: set[Future[Outcome]] = set()
+        running: set[Future[T]] = set()
         while True:
             for each in remaining:
-                running.add(pool.submit(fly, each))
+                running.add(pool.submit(function, each))
                 if len(running) >= 2 * workers:
                     break
             if not running:

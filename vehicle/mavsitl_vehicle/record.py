@@ -27,9 +27,6 @@ from mavsitl_vehicle.sensors.status import EstimatorStatus
 if TYPE_CHECKING:
     from mavsitl_vehicle.vehicle import Vehicle
 
-# vehicle_status.arming_state
-DISARMED, ARMED = 1, 2
-
 # Columns of the vehicle's log block.
 _TRUTH = slice(0, 17)
 _ESTIMATE = slice(17, 30)
@@ -103,7 +100,9 @@ class Record:
         if status != self._last_status:
             self._last_status = status
             nav_state = modes.TABLE[commander.mode].nav_state
-            self._status.append(now_us, ARMED if commander.armed else DISARMED, nav_state, int(commander.failsafe))
+            self._status.append(
+                now_us, topics.ARMED if commander.armed else topics.DISARMED, nav_state, int(commander.failsafe)
+            )
         landed = int(autopilot.land.released_us is None or autopilot.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND)
         if landed != self._last_land:
             self._last_land = landed
