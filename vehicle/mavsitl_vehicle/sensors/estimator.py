@@ -29,8 +29,8 @@ REST_PERIOD_US = 200_000
 REST_VELOCITY_M_S = 0.001
 START_POSITION_M = 0.01
 """1 sigma of the start pose, which is where the local frame is."""
-START_ATTITUDE_RAD = 0.5
-"""Before gravity and field have been looked at."""
+WIDE = 5.0
+"""The attitude of the alignment is taken for so many times as uncertain before gravity and field are fused with it."""
 UNKNOWN_M = 1e3
 UNKNOWN_M_S = 30.0
 UNKNOWN_GAUSS = 0.5
@@ -276,7 +276,13 @@ class SensedEstimator:
             ekf.forget(p, ekf.E_POSITION, 3, UNKNOWN_M**2)
         self._coarse(means[3:] - x[ekf.ACCEL_BIAS : ekf.ACCEL_BIAS + 3], field - x[ekf.MAG_OFFSET :])
         ekf.forget(p, ekf.E_VELOCITY, 3, REST_VELOCITY_M_S**2)
-        ekf.forget(p, ekf.E_ATTITUDE, 3, START_ATTITUDE_RAD**2)
+        # Wide enough to count for nothing, and no wider: far from it, the measurements are not linear in the heading.
+        tilt_rad = WIDE * (0.002 + settings.imu.accel_bias_m_s2 / self._gravity)
+        north, dip = abs(float(self._field[0])), abs(float(self._field[2]))
+        own = settings.magnetometer.offset_gauss + settings.magnetometer.noise_gauss
+        heading_rad = min((WIDE * own + dip * tilt_rad) / max(north, 1e-3), 0.5)
+        ekf.forget(p, ekf.E_ATTITUDE, 2, tilt_rad**2)
+        ekf.forget(p, ekf.E_ATTITUDE + 2, 1, heading_rad**2)
         x[ekf.GYRO_BIAS : ekf.GYRO_BIAS + 3] = means[:3]
         ekf.forget(
             p, ekf.E_GYRO_BIAS, 3,
