@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heappop, heappush
+from math import inf
 from typing import TYPE_CHECKING
 
 from mavsitl.chaos.base import Message, Mode, Peer
@@ -127,9 +128,8 @@ class Chaos:
         wanted: dict[tuple[str, str], None] = {}
         for window in self._windows:
             clock_s = simulated_s if window.clock == "simulated" else flight_time_s
-            if window.start_s <= clock_s and (
-                window.duration_s is None or clock_s < window.start_s + window.duration_s
-            ):
+            end_s = inf if window.duration_s is None else window.start_s + window.duration_s
+            if window.start_s <= clock_s < end_s:
                 wanted[window.mode, window.port] = None
         before, self._scheduled = self._scheduled, wanted
         for key in wanted:
