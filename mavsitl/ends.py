@@ -80,14 +80,9 @@ IMPAIRED_GRACE_S = 300.0
 """Over an impaired link a flight in lock-step that takes so much longer than its scenario says will never end."""
 
 
-def _impaired_lockstep(flight: Flight) -> bool:
-    """Whether a tick may pass without an answer: over an impaired link, or where the vehicle misbehaves."""
-    return flight.scenario.link != LinkModel() or bool(flight.scenario.chaos)
-
-
 def _channels(flight: Flight) -> Channels | None:
     """Of the off-board link in lock-step; None where each tick is answered."""
-    if not _impaired_lockstep(flight):
+    if not flight.scenario.impaired:
         return None
     from mavsitl.link.impaired import Channels  # here, for it loads numpy
 
@@ -348,7 +343,7 @@ def ground_lockstep(
             watch = _Watch(core)
             end_us = drivers.run_lockstep_ground(
                 core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
-                impaired=_impaired_lockstep(flight),
+                impaired=flight.scenario.impaired,
             )  # fmt: skip
             return watch.outcome(end_us, tap)
     finally:

@@ -455,6 +455,13 @@ class Scenario(Section, frozen=True):
     controller: Controller = Controller()
     reference: Reference = Hover()
 
+    @property
+    def impaired(self) -> bool:
+        """In lock-step: a tick may pass without an answer, over a link that is not perfect, or where the vehicle
+        misbehaves. Then each tick is an exchange of whatever is due, of nothing, too.
+        """
+        return self.link != LinkModel() or bool(self.chaos)
+
 
 class Flight(msgspec.Struct, frozen=True):
     """A scenario made ready: its file resolved, its airframe loaded."""

@@ -27,6 +27,7 @@ from mavsitl_vehicle.failures import (
     kinds,
     named,
 )
+from mavsitl_vehicle.links import FAILURES
 from mavsitl_vehicle.motors import GARBAGE_S
 from mavsitl_vehicle.simulation import Simulation
 from mavsitl_vehicle.vehicle import Vehicle
@@ -237,6 +238,18 @@ def test_a_battery_that_fails() -> None:
     assert (pack.charge, pack.voltage_v, pack.level) == (1.0, whole_v, Level.FINE)
 
 
+def test_a_battery_that_is_hardly_read() -> None:
+    client = flying(2.0)
+    pack = client.vehicle.autopilot.battery
+    inject(client, BATTERY, Kind.SLOW)
+    client.run(1.0)
+    read = pack.charge
+    client.run(15.0)
+    assert pack.charge == read
+    client.run(6.0)
+    assert pack.charge < read, "what it gave meanwhile is counted when it is read"
+
+
 def test_a_stuck_battery_drains_unseen() -> None:
     client = standing()
     set_parameter(client, "SIM_BAT_DRAIN", 20)
@@ -337,7 +350,8 @@ def test_telemetry_that_hangs() -> None:
 
 def test_every_row_of_the_table_has_its_test() -> None:
     tested = {(Unit.MOTOR, kind) for kind in MOTORS}
-    tested |= {(Unit.BATTERY, kind) for kind in (Kind.OFF, Kind.WRONG, Kind.STUCK)}
+    tested |= {(Unit.BATTERY, kind) for kind in (Kind.OFF, Kind.WRONG, Kind.STUCK, Kind.SLOW)}
+    tested |= {(Unit.MAVLINK, kind) for kind in FAILURES}  # in tests/drivers/test_failed_links.py
     tested |= {(unit, kind) for unit in (Unit.RC, Unit.MAVLINK) for kind in (Kind.OFF, Kind.STUCK)}
     assert {row for row in TABLE if row[0] not in SENSORS} == tested
     assert all(text.endswith(".") for text in TABLE.values())
@@ -479,7 +493,7 @@ ANSWERS: list[tuple[tuple[float, ...], int, str]] = [
     ),
     ((nan, 1, 0), DENIED, "Failure injection refused: param1 is nan, need a FAILURE_UNIT"),
     ((101.5, 1, 0), DENIED, "Failure injection refused: param1 is 101.5, need a FAILURE_UNIT"),
-    ((101, inf, 0), DENIED, "Failure injection refused: param2 is inf, need a FAILURE_TYPE"),
+    ((101, inf, 0), DENIED, "Command 420 refused: param2 is inf"),
     ((101, 1, nan), DENIED, "Failure injection refused: param3 is nan, need an instance, 0 for all"),
     ((101, 1, 0.5), DENIED, "Failure injection refused: param3 is 0.5, need an instance, 0 for all"),
     ((101, 1, 5), DENIED, "Failure injection refused: motor has no instance 5; allowed: 0 (all) to 4"),

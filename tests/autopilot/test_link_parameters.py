@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from mavsitl_vehicle import failures
 from mavsitl_vehicle.autopilot.parameters import TABLE
-from mavsitl_vehicle.failures import Kind
+from mavsitl_vehicle.failures import Kind, Unit
 from mavsitl_vehicle.links import FAILURES, NAMES, NO_GCS, PERFECT, initial_links
 from mavsitl_vehicle.vehicle import Vehicle
 
@@ -114,21 +115,22 @@ def test_a_failure_of_the_unit_mavlink_lies_over_the_parameters() -> None:
     assert vehicle.parameters.set("SIM_LINK_LOSS", 0.5) is None
     told = Told(vehicle)
     told.take()
-    assert vehicle.links.fail(1, Kind.OFF) is None
-    assert vehicle.links.fail(2, Kind.INTERMITTENT) is None
-    assert vehicle.links.fail(1, Kind.STUCK) == "a link cannot be stuck"
-    assert vehicle.links.fail(1, Kind.OK) is None
+    for instance, kind in ((1, Kind.DELAYED), (2, Kind.INTERMITTENT), (1, Kind.OK)):
+        vehicle.failures.set(Unit.MAVLINK, kind, instance)
     assert told.take() == [
-        ("link", Overlay({"LOSS": 0.5}, 0, {"DOWN": 1.0})),
-        ("gcs_link", Overlay({}, 0, FAILURES[Kind.INTERMITTENT][0])),
+        ("link", Overlay({"LOSS": 0.5}, 0, {"LAT": 500.0})),
+        ("gcs_link", Overlay({}, 0, FAILURES[Kind.INTERMITTENT])),
         ("link", Overlay({"LOSS": 0.5})),
     ]
-    assert lockstep().links.fail(1, Kind.OFF) == PERFECT
+
+
+def test_each_failure_of_a_link_is_made_by_its_channel_or_by_the_port() -> None:
+    kinds = {kind for unit, kind in failures.TABLE if unit is Unit.MAVLINK}
+    assert kinds == {*FAILURES, Kind.OFF, Kind.STUCK}
 
 
 def test_every_failure_is_within_the_parameters_limits() -> None:
-    for settings, text in FAILURES.values():
-        assert text
+    for settings in FAILURES.values():
         assert all(TABLE[NAMES["link"][key]].problem(value) is None for key, value in settings.items())
 
 

@@ -10,7 +10,6 @@ from functools import cache
 import numpy as np
 import pytest
 from mavsitl_vehicle.sensors import ekf
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from tests.sensors.rig import PERIOD_S, Rig, Watch
@@ -46,7 +45,7 @@ def flown(seed: int) -> dict[str, float]:
 
 @pytest.mark.parametrize("name", ROWS)
 def test_errors_are_as_large_as_the_covariance_says(name: str) -> None:
-    values: NDArray[np.float64] = np.array([flown(seed)[name] for seed in SEEDS])
+    values = np.array([flown(seed)[name] for seed in SEEDS])
     rows = ROWS[name]
     degrees = (rows.stop - rows.start) * len(values)
     low, high = chi2.ppf((0.0005, 0.9995), degrees)

@@ -12,7 +12,7 @@ from math import inf, isfinite, nan
 from typing import NamedTuple
 
 from mavsitl.dialect import mavlink
-from mavsitl.scenario import Failure, Flight, LinkModel, Scenario, ScenarioError
+from mavsitl.scenario import Failure, Flight, Scenario, ScenarioError
 
 
 class Unit(IntEnum):
@@ -102,10 +102,12 @@ TABLE: Mapping[tuple[Unit, Kind], str] = {
     (Unit.RC, Kind.OFF): "MANUAL_CONTROL is not heard.",
     (Unit.RC, Kind.STUCK): "The sticks stay as they were and count as fresh, whatever comes.",
     (Unit.MAVLINK, Kind.OFF): "Nothing comes in and nothing goes out.",
-    (
-        Unit.MAVLINK,
-        Kind.STUCK,
-    ): "Telemetry repeats the state of the moment under new time stamps. Mode, arming, texts and answers stay true.",
+    (Unit.MAVLINK, Kind.STUCK): "Telemetry repeats the state of the moment under new time stamps. "
+    "Mode, arming, texts and answers stay true.",
+    (Unit.MAVLINK, Kind.GARBAGE): "A fifth of the messages have flipped bits, both ways.",
+    (Unit.MAVLINK, Kind.SLOW): "57.6 kbit/s each way, a telemetry radio's; what does not fit its queue is lost.",
+    (Unit.MAVLINK, Kind.DELAYED): "500 ms later, each way.",
+    (Unit.MAVLINK, Kind.INTERMITTENT): "Bursts of 500 ms in which all is lost, every 2.5 s on average, each way.",
 }
 """What each supported combination does."""
 
@@ -155,13 +157,17 @@ def has_sensors(scenario: Scenario) -> bool:
     return estimator is not None and estimator.kind == "ekf"
 
 
-SILENCE = (Unit.MAVLINK, Kind.OFF)
-NO_SILENCE = "in lock-step it needs an impaired [link]: over a perfect one time goes by telemetry"
+NO_SILENCE = "in lock-step it needs an impaired [link], e.g. link.live: over a perfect one time goes by telemetry"
+
+
+def silences(unit: int, kind: int) -> bool:
+    """Whether messages are late or lost by it."""
+    return unit == Unit.MAVLINK and kind not in (Kind.OK, Kind.STUCK)
 
 
 def may_fall_silent(scenario: Scenario, *, lockstep: bool) -> bool:
-    """Does the peer's clock go on where the vehicle says nothing? If not, `SILENCE` would stop the flight for good."""
-    return not lockstep or scenario.link != LinkModel()
+    """Does the peer's clock go on where the vehicle says nothing? If not, what `silences` would end the flight."""
+    return not lockstep or scenario.impaired
 
 
 def unsupported(unit: int, kind: int, *, sensors: bool) -> str | None:
@@ -323,8 +329,8 @@ class _Planned:
         where = f"{flight.name}: failures[{number}]"
         if problem := unsupported(self.unit, self.kind, sensors=has_sensors(flight.scenario)):
             raise ScenarioError(f"{where}.type: {problem}")
-        if (self.unit, self.kind) == SILENCE and not may_fall_silent(flight.scenario, lockstep=lockstep):
-            raise ScenarioError(f"{where}.type: mavlink off: {NO_SILENCE}")
+        if silences(self.unit, self.kind) and not may_fall_silent(flight.scenario, lockstep=lockstep):
+            raise ScenarioError(f"{where}.type: mavlink {self.asked.type}: {NO_SILENCE}")
         if problem := instance_problem(self.unit, self.asked.instance):
             raise ScenarioError(f"{where}.instance: {problem}")
         value = self.asked.value

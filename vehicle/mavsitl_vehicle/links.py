@@ -12,7 +12,7 @@ from typing import TypeAlias
 from mavsitl.link.settings import DIRECTION, KEYS, LinkName, Overlay, initial
 from mavsitl.scenario import LinkModel, Scenario, ScenarioError
 from mavsitl_vehicle.autopilot.parameters import TABLE, Parameters
-from mavsitl_vehicle.failures import Kind
+from mavsitl_vehicle.failures import Change, Failures, Kind, Unit
 
 Listener: TypeAlias = Callable[[LinkName, Overlay], None]
 
@@ -22,17 +22,16 @@ NAMES: Mapping[LinkName, Mapping[str, str]] = {
 }
 """The parameter of each setting."""
 
-INSTANCES: Mapping[int, LinkName] = {1: "link", 2: "gcs_link"}
+INSTANCES: Mapping[LinkName, int] = {"link": 1, "gcs_link": 2}
 """Of the failure unit MAVLINK."""
 
-FAILURES: Mapping[Kind, tuple[Mapping[str, float], str]] = {
-    Kind.OFF: ({"DOWN": 1.0}, "nothing comes through"),
-    Kind.GARBAGE: ({"CORR": 0.2}, "a fifth of the messages have flipped bits"),
-    Kind.SLOW: ({"BW": 57.6}, "57.6 kbit/s, a telemetry radio's; what does not fit is lost"),
-    Kind.DELAYED: ({"LAT": 500.0}, "500 ms later, each way"),
-    Kind.INTERMITTENT: ({"BURST": 500.0, "GOOD": 2000.0}, "bursts of 500 ms, every 2.5 s on average"),
+FAILURES: Mapping[Kind, Mapping[str, float]] = {
+    Kind.GARBAGE: {"CORR": 0.2},
+    Kind.SLOW: {"BW": 57.6},
+    Kind.DELAYED: {"LAT": 500.0},
+    Kind.INTERMITTENT: {"BURST": 500.0, "GOOD": 2000.0},
 }
-"""Settings of a link that has this failure, over the parameters', both ways; and what they mean."""
+"""Settings of a link that has this failure, over the parameters', both ways. The ports make `OFF` and `STUCK`."""
 
 PERFECT = (
     "the lock-step exchange of this flight has a perfect link; give the scenario a [link], or link.live = true, "
@@ -56,26 +55,27 @@ def _parameters(link: LinkName, model: LinkModel) -> Iterator[tuple[str, float]]
 class LinkControl:
     """The links' parameters and failures as overlays over the scenario's links."""
 
-    def __init__(self, parameters: Parameters, scenario: Scenario, *, lockstep: bool) -> None:
+    def __init__(self, parameters: Parameters, failures: Failures, scenario: Scenario, *, lockstep: bool) -> None:
         """In `lockstep` the parameters of links that cannot change are locked.
 
         Raises `ScenarioError` where the scenario itself sets one of those of the off-board link.
         """
         self._parameters = parameters
         self._initial = initial_links(scenario)
-        self._failures: dict[LinkName, Kind] = {}
+        self._failures = failures
         self._listeners: list[Listener] = []
         self._told: dict[LinkName, Overlay] = {}
         self._refusals: dict[LinkName, str] = {}
         if lockstep:
             self._refusals["gcs_link"] = NO_GCS
-            if scenario.link == LinkModel():
+            if not scenario.impaired:
                 self._refusals["link"] = PERFECT
                 for name in self.overlay("link").values:
                     raise ScenarioError(f"parameters.{NAMES['link'][name]}: {PERFECT}")
         for link, reason in self._refusals.items():
             parameters.lock(self._initial[link], reason)
         parameters.subscribe(self._on_parameter)
+        failures.subscribe(self._on_failure)
 
     def refusal(self, link: LinkName) -> str | None:
         """Why nothing can be changed on this link in this flight; None where it can."""
@@ -86,19 +86,8 @@ class LinkControl:
         names, begun = NAMES[link], self._initial[link]
         now = {key: self._parameters[names[key]] for key in KEYS}
         values = {key: value for key, value in now.items() if _single(value) != _single(begun[names[key]])}
-        failure, _ = FAILURES.get(self._failures.get(link, Kind.OK), ({}, ""))
+        failure = FAILURES.get(self._failures.of(Unit.MAVLINK, INSTANCES[link]), {})
         return Overlay(values, int(self._parameters[names[DIRECTION]]), failure)
-
-    def fail(self, instance: int, kind: Kind) -> str | None:
-        """Instance 1 (off-board) or 2 (ground stations) of the unit MAVLINK; None where it is done, else why not."""
-        link = INSTANCES[instance]
-        if kind is not Kind.OK and kind not in FAILURES:
-            return f"a link cannot be {kind.name.lower()}"
-        if kind is not Kind.OK and link in self._refusals:
-            return self._refusals[link]
-        self._failures[link] = kind
-        self._tell(link)
-        return None
 
     def subscribe(self, listener: Listener) -> None:
         """Hear of every link now, and then of each that changes."""
@@ -110,6 +99,12 @@ class LinkControl:
         for link, names in self._initial.items():
             if name in names:
                 self._tell(link)
+
+    def _on_failure(self, change: Change) -> None:
+        if change.unit is Unit.MAVLINK:
+            for link, instance in INSTANCES.items():
+                if instance == change.instance:
+                    self._tell(link)
 
     def _tell(self, link: LinkName) -> None:
         overlay = self.overlay(link)

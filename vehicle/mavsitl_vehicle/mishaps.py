@@ -14,6 +14,10 @@ from mavsitl_vehicle.wind.field import mil_axes
 if TYPE_CHECKING:
     from mavsitl_vehicle.vehicle import Vehicle
 
+HAPPENINGS = ("SIM_CPU_STALL", "SIM_CLK_JUMP", "SIM_GUST_TRIG")
+EVENTS = (*failures.PARAMETERS, *failures.EFFICIENCIES, *HAPPENINGS)
+"""Parameters that make something happen when they are set."""
+
 
 class Mishaps:
     """Makes of the parameters what they say, and shows in them what has happened, whoever asked for it."""
@@ -22,8 +26,8 @@ class Mishaps:
         """Raises `ScenarioError` where the scenario or the airframe has such a parameter: these are no settings."""
         self._vehicle = vehicle
         self._parameters = vehicle.parameters
-        for name, row in TABLE.items():
-            if row.volatile and self._parameters[name] != row.default:
+        for name in EVENTS:
+            if self._parameters[name] != TABLE[name].default:
                 raise ScenarioError(
                     f"{vehicle.name}: parameters.{name}: it happens in flight and is no setting; see [[failures]]"
                 )
@@ -59,7 +63,7 @@ class Mishaps:
     def mend(self) -> None:
         """The vehicle starts anew: nothing is broken, nothing happens."""
         self._vehicle.failures.clear()
-        for name in ("SIM_CPU_STALL", "SIM_CLK_JUMP", "SIM_GUST_TRIG"):
+        for name in HAPPENINGS:
             self._parameters.put(name, TABLE[name].default)
 
     # --- parameters --------------------------------------------------------------------------------------------------
@@ -70,7 +74,7 @@ class Mishaps:
             return None
         if name in failures.PARAMETERS:
             unit, _ = failures.PARAMETERS[name]
-            if (unit, value) == failures.SILENCE and not vehicle.autopilot.may_fall_silent:
+            if failures.silences(unit, int(value)) and not vehicle.autopilot.may_fall_silent:
                 return failures.NO_SILENCE
             return failures.unsupported(unit, int(value), sensors=vehicle.autopilot.has_sensors)
         if name == "SIM_CPU_STALL" and not vehicle.autopilot.may_fall_silent:

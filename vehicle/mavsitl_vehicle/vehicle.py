@@ -108,7 +108,7 @@ class Vehicle:
         self._timeline = Timeline(flight, self.failures, lockstep=lockstep)
         self.simulation = Simulation(flight, self.parameters, seed, failures=self.failures)
         self.autopilot = self._boot(0)
-        self.links = LinkControl(self.parameters, flight.scenario, lockstep=lockstep)
+        self.links = LinkControl(self.parameters, self.failures, flight.scenario, lockstep=lockstep)
         self.parameters.subscribe(self._on_parameter)
         self._mishaps = Mishaps(self)
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None

@@ -420,7 +420,7 @@ def _inject_failure(autopilot: Autopilot, command: Command, now_us: int, port: P
     if problem := failures.unsupported(unit, kind, sensors=autopilot.has_sensors):
         return _deny(autopilot, f"Failure injection refused: {problem}", UNSUPPORTED)
     problem = failures.instance_problem(Unit(unit), instance)
-    if (unit, kind) == failures.SILENCE and not autopilot.may_fall_silent:
+    if failures.silences(unit, kind) and not autopilot.may_fall_silent:
         problem = failures.NO_SILENCE
     if problem:
         return _deny(autopilot, f"Failure injection refused: {problem}")
