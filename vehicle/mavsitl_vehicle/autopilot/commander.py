@@ -309,15 +309,19 @@ class Commander:
                 return self.request_mode(mode, "") == ACCEPTED
         return False
 
-    def request_kill(self, engage: bool, *, latch: bool = False) -> None:
+    def request_kill(self, engage: bool, *, latch: bool = False) -> int:
         """The kill switch: the rotors stop at once, and the vehicle disarms when COM_KILL_DISARM has passed.
 
         `latch`: only a reboot releases it.
         """
-        if engage == self.kill_engaged or (self._kill_latched and not engage):
-            return
-        self.kill_engaged, self._kill_latched = engage, latch
-        self._report(mavlink.MAV_SEVERITY_EMERGENCY, "Kill engaged" if engage else "Kill disengaged")
+        if self._kill_latched and not engage:
+            self._report(mavlink.MAV_SEVERITY_WARNING, "Kill stays engaged until a reboot")
+            return TEMPORARILY_REJECTED
+        self._kill_latched |= latch
+        if engage != self.kill_engaged:
+            self.kill_engaged = engage
+            self._report(mavlink.MAV_SEVERITY_EMERGENCY, "Kill engaged" if engage else "Kill disengaged")
+        return ACCEPTED
 
     def request_arm(self, arm: bool, force: bool, now_us: int, by: str = "external command") -> int:
         """COMPONENT_ARM_DISARM. `force` disarms in the air; it never skips the checks before arming, as on PX4."""
