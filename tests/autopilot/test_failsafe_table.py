@@ -622,8 +622,8 @@ def test_a_kill_that_is_taken_back_in_time_does_not_disarm() -> None:
 
 def test_a_latched_kill_stays_and_does_not_arm() -> None:
     flight = Flight()
-    flight.commander.request_kill(True, latch=True)
-    flight.commander.request_kill(False)
+    assert flight.commander.request_kill(True, latch=True) == ACCEPTED
+    assert flight.commander.request_kill(False) == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
     assert flight.commander.kill_engaged
     flight.run(6.0)
     assert flight.commander.request_arm(True, False, flight.now_us) == mavlink.MAV_RESULT_TEMPORARILY_REJECTED

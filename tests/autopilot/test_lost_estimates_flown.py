@@ -216,7 +216,7 @@ def test_both_sticks_in_their_outer_corners_kill_for_good() -> None:
     assert "Kill engaged" not in client.texts()
     client.run(0.1, corners)
     assert "Kill engaged" in client.texts()
-    assert client.result(TERMINATE, 0) == ACCEPTED
+    assert client.result(TERMINATE, 0) == REJECTED
     client.run_until(lambda: not client.armed, 1.2)
     assert client.arm() == REJECTED
     client.tick()

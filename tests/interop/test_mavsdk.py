@@ -214,6 +214,10 @@ def test_kill_stops_the_rotors_in_the_air(flying: Pilot) -> None:
 def test_terminate(flying: Pilot) -> None:
     flying.action.terminate()
     flying.wait("landed_state", lambda state: bool(state.name == "ON_GROUND"))
+    flying.wait("armed", lambda armed: not armed)
+    flying.wait("health", lambda health: not health.is_armable)
+    flying.action.reboot()  # nothing less ends it
+    flying.wait("health", lambda health: bool(health.is_armable))
 
 
 def test_goes_to_a_place(flying: Pilot) -> None:

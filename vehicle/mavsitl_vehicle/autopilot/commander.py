@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from math import inf, radians
+from operator import attrgetter
 from typing import NamedTuple
 
 from mavsitl.dialect import mavlink
@@ -308,15 +309,19 @@ class Commander:
                 return self.request_mode(mode, "") == ACCEPTED
         return False
 
-    def request_kill(self, engage: bool, *, latch: bool = False) -> None:
+    def request_kill(self, engage: bool, *, latch: bool = False) -> int:
         """The kill switch: the rotors stop at once, and the vehicle disarms when COM_KILL_DISARM has passed.
 
         `latch`: only a reboot releases it.
         """
-        if engage == self.kill_engaged or (self._kill_latched and not engage):
-            return
-        self.kill_engaged, self._kill_latched = engage, latch
-        self._report(mavlink.MAV_SEVERITY_EMERGENCY, "Kill engaged" if engage else "Kill disengaged")
+        if self._kill_latched and not engage:
+            self._report(mavlink.MAV_SEVERITY_WARNING, "Kill stays engaged until a reboot")
+            return TEMPORARILY_REJECTED
+        self._kill_latched |= latch
+        if engage != self.kill_engaged:
+            self.kill_engaged = engage
+            self._report(mavlink.MAV_SEVERITY_EMERGENCY, "Kill engaged" if engage else "Kill disengaged")
+        return ACCEPTED
 
     def request_arm(self, arm: bool, force: bool, now_us: int, by: str = "external command") -> int:
         """COMPONENT_ARM_DISARM. `force` disarms in the air; it never skips the checks before arming, as on PX4."""
@@ -446,8 +451,15 @@ class Commander:
             self._delay.end()  # acting already: what comes next need not wait
         self._delaying = False
         worst = _A.NONE
-        for row in FAILSAFES:
-            action = self._act(row) if self._trips(row, now_us) else self._clear(row)
+        remembered = bool(self._tripped or self._since_us or self._overridden)
+        for tripped, row in _WATCHED:
+            if tripped(self):
+                action = self._act(row) if self._lasts(row, now_us) else self._clear(row)
+            elif remembered:
+                self._since_us.pop(row.name, None)
+                action = self._clear(row)
+            else:
+                continue
             if action > worst:
                 worst = action
         self._worst = worst
@@ -462,11 +474,8 @@ class Commander:
             self.mode = self.intended
             self._acting = False
 
-    def _trips(self, row: Failsafe, now_us: int) -> bool:
-        if not row.tripped(self):
-            if row.after:
-                self._since_us.pop(row.name, None)
-            return False
+    def _lasts(self, row: Failsafe, now_us: int) -> bool:
+        """The cause has been there for as long as it must."""
         if not row.after:
             return True
         return now_us - self._since_us.setdefault(row.name, now_us) >= int(self.parameters[row.after] * 1e6)
@@ -677,7 +686,8 @@ def _flown_for(share: float) -> Callable[[Commander], bool]:
 
 def _wind_beyond(parameter: str) -> Callable[[Commander], bool]:
     def tripped(commander: Commander) -> bool:
-        return commander.situation.wind_m_s > commander.parameters[parameter] > 0.0
+        wind_m_s = commander.situation.wind_m_s
+        return wind_m_s > 0.0 and wind_m_s > commander.parameters[parameter] > 0.0
 
     return tripped
 
@@ -691,17 +701,17 @@ def _mission_failed(commander: Commander) -> bool:
 
 
 def _position_inaccurate(commander: Commander) -> bool:
-    situation = commander.situation
-    if not situation.position_error_m > commander.parameters["COM_POS_LOW_EPH"] > 0.0:
+    if commander.intended is not Mode.LOITER and commander.intended is not Mode.MISSION:
         return False
-    return commander.intended in (Mode.MISSION, Mode.LOITER) and situation.position_valid
+    situation = commander.situation
+    return situation.position_valid and situation.position_error_m > commander.parameters["COM_POS_LOW_EPH"] > 0.0
 
 
 def _estimate_lost(need: Need, name: str) -> Callable[[Commander], bool]:
-    field = f"{name}_valid"
+    valid = attrgetter(f"situation.{name}_valid")
 
     def tripped(commander: Commander) -> bool:
-        return not getattr(commander.situation, field) and need in modes.TABLE[commander.intended].needs
+        return not valid(commander) and need in modes.TABLE[commander.intended].needs
 
     return tripped
 
@@ -716,11 +726,11 @@ def _fallback_action(commander: Commander) -> Action:
 
 def _tilted(axis: str, parameter: str) -> Callable[[Commander], bool]:
     """Not where the mode turns the vehicle by rates: ACRO, and OFFBOARD with rates."""
-    field = f"{axis}_rad"
+    angle_rad = attrgetter(f"situation.{axis}_rad")
 
     def tripped(commander: Commander) -> bool:
         limit_deg = commander.parameters[parameter]
-        if not limit_deg or not abs(getattr(commander.situation, field)) > radians(limit_deg):
+        if not limit_deg or not abs(angle_rad(commander)) > radians(limit_deg):
             return False
         if commander.mode is Mode.OFFBOARD:
             return Need.ATTITUDE in commander.situation.stream_needs
@@ -738,7 +748,8 @@ def _detector_action(commander: Commander) -> Action:
 
 
 def _altitude_lost(commander: Commander) -> bool:
-    return commander.situation.altitude_loss_m > commander.parameters["FD_ALT_LOSS"] > 0.0
+    loss_m = commander.situation.altitude_loss_m
+    return loss_m > 0.0 and loss_m > commander.parameters["FD_ALT_LOSS"] > 0.0
 
 
 def _motor_failed(commander: Commander) -> bool:
@@ -830,4 +841,5 @@ FAILSAFES: tuple[Failsafe, ...] = (
 )  # fmt: skip
 """New rows go to the end: the reference lists them in this order."""
 
+_WATCHED = tuple((row.tripped, row) for row in FAILSAFES)
 _NOT_OVERRULED = {row.name for row in FAILSAFES if not row.overruled}

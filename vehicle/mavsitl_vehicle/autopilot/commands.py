@@ -149,8 +149,7 @@ def _terminate(autopilot: Autopilot, command: Command, now_us: int, port: Port) 
     if wanted not in (0, 1, 2):
         return _deny(autopilot, f"Termination refused: param1 is {command.params[0]:g}, need 0, 1 or 2")
     if wanted != 1:
-        autopilot.commander.request_kill(wanted == 2)
-        return ACCEPTED
+        return autopilot.commander.request_kill(wanted == 2)
     if not autopilot.commander.armed:
         return _deny(autopilot, "Termination refused: not armed")
     return autopilot.request_mode(Mode.TERMINATION, "termination", now_us)
