@@ -61,10 +61,7 @@ TABLE: Mapping[tuple[Unit, Kind], str] = {
     (Unit.RC, Kind.OFF): "MANUAL_CONTROL is not heard.",
     (Unit.RC, Kind.STUCK): "The sticks stay as they were and count as fresh, whatever comes.",
     (Unit.MAVLINK, Kind.OFF): "Nothing comes in and nothing goes out.",
-    (
-        Unit.MAVLINK,
-        Kind.STUCK,
-    ): "Telemetry repeats the state of the moment under new time stamps. Mode, arming, texts and answers stay true.",
+    (Unit.MAVLINK, Kind.STUCK): "Telemetry repeats the state of the moment, newly stamped; mode and answers stay true.",
 }
 """What each supported combination does."""
 
