@@ -387,13 +387,14 @@ class Ground:
         low = height_m < CRASHED_HEIGHT_M
         flies = handshake.phase is Phase.FLY
         self._has_flown = flies and (self._has_flown or height_m > CRASHED_HEIGHT_M + CRASHED_BELOW_M)
-        if not low or handshake.lost or not (flies or handshake.phase is Phase.STOP):
+        if not low or handshake.lost or handshake.phase not in (Phase.FLY, Phase.STOP):
             self._down_since_us = None
             return
         phi, theta, _ = state.angles_rad[:, 0].tolist()
         upright = cos(phi) * cos(theta)
         below_m = self._controller.reference[0][2] - height_m
-        if not (upright < CRASHED_TILT_COS or (self._has_flown and below_m > CRASHED_BELOW_M)):
+        sunk = self._has_flown and handshake.in_control and below_m > CRASHED_BELOW_M
+        if not (upright < CRASHED_TILT_COS or sunk):
             self._down_since_us = None
         elif self._down_since_us is None:
             self._down_since_us = state.stamp_us

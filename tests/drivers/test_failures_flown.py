@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mavsitl_ground.controller import Ground
 from mavsitl_vehicle.failures import Failures, Kind, Timeline, Unit
 from mavsitl_vehicle.vehicle import Vehicle
 
 from mavsitl import pair, scenario
 from mavsitl.cli import main
+from mavsitl.drivers import fly_in_memory as fly
 from mavsitl.ends import NullRecorder
+from mavsitl.link.impaired import channels_for
 from mavsitl.report.html import show
 from mavsitl.report.metrics import aftermath, paper_case
 from mavsitl.report.run import record
@@ -211,6 +214,19 @@ def test_a_vehicle_that_disarms_itself_in_flight_is_lost() -> None:
     flown = fly_in_memory(flight)
     assert flown.phase == "ABORTED"
     assert [status.armed for status in flown.data.statuses] == [True, False]
+
+
+def test_a_landing_by_fail_safe_is_no_crash() -> None:
+    """The vehicle comes down far below its reference, but it is not the controller that flies it."""
+    deaf = {"link__to_vehicle__outages": [{"start_s": 3.0, "duration_s": 60.0}]}
+    high = {"reference__steps": [{"time_s": 0.0, "position_nwu_m": [0.0, 0.0, 2.0]}]}
+    flight = shortened("takeoff-hover", 30.0, parameters__COM_OBL_RC_ACT=4, **deaf, **high)
+    vehicle, said = Vehicle(flight, NullRecorder(), seed=1, lockstep=True), list[str]()
+    ground = Ground(flight, NullRecorder(), report=said.append)
+    fly(vehicle, ground, max_time_s=60.0, channels=channels_for(flight.scenario.link, 1))
+    assert ground.phase == "ABORTED"
+    assert said[-1] == ground.lost == "the vehicle was disarmed in flight"
+    assert not any(text.startswith("crashed") for text in said)
 
 
 def test_the_page_of_a_flight_without_failures_says_nothing_of_them() -> None:

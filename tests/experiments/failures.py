@@ -133,12 +133,13 @@ FAILURE_WORDS = """\
 With one rotor gone no set of the other three holds roll, pitch and yaw at once. The allocation gives up yaw: the
 opposite rotor is stopped but for what roll and pitch need, and the pair that is left turns the vehicle about its axis,
 ever faster. At their largest speed the two just carry its weight while it is level; so it comes down, and hits the
-ground hard.
+ground hard: under the paper's law upright, whether aboard or not, under the stock cascade on its back.
 """
 LOSS_WORDS = """\
-The rate loop of the paper's airframe is proportional, so a constant torque that it does not know leaves a constant rate
-error, which the loops above take away; the thrust that is missing is found by the altitude's integrator and the wind
-observer, which cannot tell it from wind.
+The weak rotor is asked for more, as the vehicle leans towards it: at 80 % for 1 / sqrt(0.8), or 1.12 times the speed of
+the others. The rotors have the reserve for it, a thrust-to-weight ratio of 2. The wind differs between the two
+stretches, so the RMSE does, too; the table below has the same stretch of wind throughout. At 50 % the weak rotor's
+largest thrust is a quarter of the weight, and nothing is left to turn with.
 """
 
 

@@ -15,7 +15,7 @@ from mavsitl.log.flight import FlightData
 from mavsitl.log.ulog import MemoryRecorder
 from mavsitl.report.metrics import PAPER_TABLES, maximum_error, rmse
 from tests.bench import bench_lockstep
-from tests.experiments import engine, learning, limits, links, results, stability
+from tests.experiments import engine, failures, learning, limits, links, results, stability
 from tests.experiments.engine import Job, Outcome
 from tests.experiments.sums import first_weights
 
@@ -230,6 +230,23 @@ def test_links_has_every_link_and_level(capsys: pytest.CaptureFixture[str]) -> N
     values = [cell.split() for cell in rows[0].split("|")[2:-1]]
     assert all(float(metres) < 0.1 and unit == "m," and angle.endswith("°") for metres, unit, angle in values)
     assert "lost" in rows[2]
+
+
+def test_failures_measures_a_fall_and_a_flight() -> None:
+    fallen, weak = (
+        failures.fly(engine.job(name, {"duration_s": duration_s}, 1))
+        for name, duration_s in ((failures.FAILURE, 20.0), (failures.LOSS, 12.0))
+    )
+    assert fallen.lost
+    assert 1.0 < fallen.fall_s < 8.0
+    assert 9.8 < fallen.altitude_m < 10.5
+    assert fallen.sink_m_s > 10.0 / fallen.fall_s
+    assert not weak.lost
+    assert weak.fall_s == weak.drift_m == inf
+    assert weak.rmse_before_m < weak.rmse_after_m < 0.2
+    assert failures.lost([fallen, weak]) == "1 of 2"
+    assert failures.median([fallen, weak], "rmse_after_m") == "–"
+    assert failures.median([fallen, weak, weak], "rmse_after_m") != "–"
 
 
 def test_links_counts_lost_flights_beside_the_median() -> None:

@@ -102,8 +102,7 @@ TABLE: Mapping[tuple[Unit, Kind], str] = {
     (Unit.RC, Kind.OFF): "MANUAL_CONTROL is not heard.",
     (Unit.RC, Kind.STUCK): "The sticks stay as they were and count as fresh, whatever comes.",
     (Unit.MAVLINK, Kind.OFF): "Nothing comes in and nothing goes out.",
-    (Unit.MAVLINK, Kind.STUCK): "Telemetry repeats the state of the moment under new time stamps. "
-    "Mode, arming, texts and answers stay true.",
+    (Unit.MAVLINK, Kind.STUCK): "Telemetry repeats the state of the moment, newly stamped; mode and answers stay true.",
     (Unit.MAVLINK, Kind.GARBAGE): "A fifth of the messages have flipped bits, both ways.",
     (Unit.MAVLINK, Kind.SLOW): "57.6 kbit/s each way, a telemetry radio's; what does not fit its queue is lost.",
     (Unit.MAVLINK, Kind.DELAYED): "500 ms later, each way.",

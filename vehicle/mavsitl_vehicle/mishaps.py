@@ -33,7 +33,7 @@ class Mishaps:
                 )
         self.stalled = False
         """The autopilot does not run."""
-        self._stall_ends_us = -inf
+        self._stalled_us = 0
         self._gust_ends_s = inf
         self.busy = False
         """`step` is needed."""
@@ -50,13 +50,14 @@ class Mishaps:
         stall_s = self._parameters["SIM_CPU_STALL"]
         if stall_s and not self.stalled:
             self.stalled = True
-            self._stall_ends_us = now_us - period_us + stall_s * 1e6 - 0.5
+            self._stalled_us = now_us - period_us
             vehicle.simulation.stall(True)
-        if self.stalled and now_us - period_us >= self._stall_ends_us:
+        lasts_us = now_us - period_us - self._stalled_us
+        if self.stalled and lasts_us >= stall_s * 1e6 - 0.5:
             self.stalled = False
             vehicle.simulation.stall(False)
             self._parameters.put("SIM_CPU_STALL", 0)
-            vehicle.note(f"Autopilot stalled for {stall_s:g} s")
+            vehicle.note(f"Autopilot stalled for {lasts_us / 1e6:g} s")
         self.busy = self.stalled or bool(self._parameters["SIM_GUST_TRIG"])
         return self.stalled
 
