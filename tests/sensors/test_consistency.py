@@ -49,7 +49,7 @@ def test_errors_are_as_large_as_the_covariance_says(name: str) -> None:
     values: NDArray[np.float64] = np.array([flown(seed)[name] for seed in SEEDS])
     rows = ROWS[name]
     degrees = (rows.stop - rows.start) * len(values)
-    low, high = chi2.ppf((0.0005, 0.9995), degrees)
+    low, high = float(chi2.ppf(0.0005, degrees)), float(chi2.ppf(0.9995, degrees))
     assert low < values.sum() < high, values.mean()
 
 
