@@ -27,7 +27,10 @@ NOWHERE = (nan, nan, nan)
 
 
 class Rig:
-    """One vehicle, or `n` of which the first is steered, at rest on the ground. `changes`: as `fly.flight`."""
+    """One vehicle, or `n` of which the first is steered, at rest on the ground.
+
+    `changes` are scenario keys with "__" for dots.
+    """
 
     def __init__(self, *, seed: int = 1, n: int = 1, scenario: str = "takeoff-hover", **changes: Any) -> None:
         overrides = {key.replace("__", "."): value for key, value in changes.items()}

@@ -287,7 +287,9 @@ class Simulation:
     def _warm_up_sensed(self, x: tick.Array, estimate: tick.Array, demand: tick.Array, inner: tick.Array) -> None:
         sensed, field = self._make_sensed(0, Failures()), self.field
         unit, held = sensed.imu, np.ones(self.n, dtype=np.bool_)
-        while not (sensed.aligned and sensed.now_us >= WARM_UP_US):
+        unit.added[:] = 0.0  # nothing that would keep it from beginning
+        unit.state[imu.BIAS : imu.BIAS + 6] = 0.0
+        while sensed.now_us < WARM_UP_US:
             for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
                 demand[tick.KIND] = kind
                 tick.advance_sensed(

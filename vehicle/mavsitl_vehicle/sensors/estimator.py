@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from heapq import heappop, heappush
 from math import radians, sqrt
 
 import numpy as np
@@ -34,6 +34,10 @@ WIDE = 5.0
 UNKNOWN_M = 1e3
 UNKNOWN_M_S = 30.0
 UNKNOWN_GAUSS = 0.5
+
+LEAST_GYRO_NOISE, LEAST_ACCEL_NOISE = 1e-6, 1e-5
+LEAST_NOISE, LEAST_MAG_NOISE = 1e-3, 1e-4
+"""The filter takes no sensor for better than this, m or m/s, gauss: exact ones would leave it no covariance."""
 
 USED_SATELLITES = 6
 """EKF2_REQ_NSATS: a fix of fewer is not used."""
@@ -92,7 +96,9 @@ class SensedEstimator:
         self._head = 0
         self._now = np.zeros((ekf.STATE_ROWS, n))
         self._due = np.zeros((6, n))
-        self._waiting: deque[tuple[SlowSensor, Measurement]] = deque()
+        self._waiting: list[tuple[int, int, SlowSensor, Measurement]] = []
+        """A heap by stamp: what came and is newer than the filter."""
+        self._count = 0
         self.came: list[tuple[SlowSensor, Measurement]] = []
         """What came in this period."""
         self.aligned = False
@@ -112,8 +118,8 @@ class SensedEstimator:
 
         imu_settings, gps, baro, mag = settings.imu, settings.gps, settings.barometer, settings.magnetometer
         process = np.zeros(ekf.PROCESS_ROWS)
-        process[ekf.GYRO_NOISE] = radians(imu_settings.gyro_noise_deg_s_rt_hz)
-        process[ekf.ACCEL_NOISE] = imu_settings.accel_noise_m_s2_rt_hz
+        process[ekf.GYRO_NOISE] = max(radians(imu_settings.gyro_noise_deg_s_rt_hz), LEAST_GYRO_NOISE)
+        process[ekf.ACCEL_NOISE] = max(imu_settings.accel_noise_m_s2_rt_hz, LEAST_ACCEL_NOISE)
         process[ekf.GYRO_WALK] = radians(imu_settings.gyro_bias_walk_deg_s_rt_s)
         process[ekf.ACCEL_WALK] = imu_settings.accel_bias_walk_m_s2_rt_s
         process[ekf.BARO_WALK] = baro.drift_m_rt_s
@@ -122,12 +128,13 @@ class SensedEstimator:
         process[ekf.GPS_DRIFT_TIME] = gps.drift_time_s
         self.process = process
         """What the filter knows of the sensors: their noise without SIM_NOISE_SCALE."""
-        self._gps_variance = np.array(
-            [gps.horizontal_noise_m**2, gps.horizontal_noise_m**2, gps.vertical_noise_m**2]
-            + [gps.velocity_noise_m_s**2] * 3
+        h, v, speed = (
+            max(sigma, LEAST_NOISE) ** 2
+            for sigma in (gps.horizontal_noise_m, gps.vertical_noise_m, gps.velocity_noise_m_s)
         )
-        self._baro_variance = np.array([baro.noise_m**2])
-        self._mag_variance = mag.noise_gauss**2
+        self._gps_variance = np.array([h, h, v, speed, speed, speed])
+        self._baro_variance = np.array([max(baro.noise_m, LEAST_NOISE) ** 2])
+        self._mag_variance = max(mag.noise_gauss, LEAST_MAG_NOISE) ** 2
         self.set_noise()
         self.status = self._make_status()
         self._restart_alignment()
@@ -182,17 +189,13 @@ class SensedEstimator:
             came = sensor.step(x, now_us)
             if came is not None:
                 self.came.append((sensor, came))
-                self._waiting.append((sensor, came))
+                self._count += 1
+                heappush(self._waiting, (came.stamp_us, self._count, sensor, came))
         if self.aligned:
             horizon_us = now_us - self.depth * self.period_us
-            waiting = self._waiting
-            if waiting and min(each.stamp_us for _, each in waiting) <= horizon_us:
-                self._waiting = deque()
-                for sensor, each in waiting:
-                    if each.stamp_us <= horizon_us:
-                        self._fuse(sensor, each)
-                    else:
-                        self._waiting.append((sensor, each))
+            while self._waiting and self._waiting[0][0] <= horizon_us:
+                _, _, sensor, each = heappop(self._waiting)
+                self._fuse(sensor, each)
             if at_rest.all():
                 self._rest(delta)
             elif self._rest_us:
@@ -214,6 +217,8 @@ class SensedEstimator:
 
     def _restart_alignment(self) -> None:
         self.aligned = False
+        self._restart_us = self.now_us
+        """What was measured before counts for nothing: the vehicle may have been elsewhere."""
         self._align_us = 0
         self._sums[:] = 0.0
         self._seen = {sensor: [] for sensor in self._slow}
@@ -236,10 +241,10 @@ class SensedEstimator:
         half = 0 if self._align_us < ALIGN_US // 2 else 1
         self._sums[half] += delta
         self._align_us += self.period_us
-        for sensor, each in self._waiting:
-            if not isinstance(sensor, Gps) or each.satellites >= USED_SATELLITES:
+        while self._waiting:
+            stamp_us, _, sensor, each = heappop(self._waiting)
+            if stamp_us > self._restart_us and (sensor is not self.gps or each.satellites >= USED_SATELLITES):
                 self._seen[sensor].append(each.values)
-        self._waiting.clear()
         if self._align_us < ALIGN_US:
             return
         # two halves, of which the first has what is over
@@ -397,7 +402,7 @@ class SensedEstimator:
         sensors = self._health(now_us)
         horizontal_us = now_us - int(self.fused_us[[GPS_VELOCITY, GPS_POSITION], 0].max())
         vertical_us = now_us - int(self.fused_us[[GPS_HEIGHT, BARO], 0].max())
-        d = [sqrt(p[i, i, 0]) for i in range(ekf.E_GYRO_BIAS + 3)]
+        d = [sqrt(max(p[i, i, 0], 0.0)) for i in range(ekf.E_GYRO_BIAS + 3)]
         tilt_rad = max(d[ekf.E_ATTITUDE], d[ekf.E_ATTITUDE + 1])
         running = self.aligned and sensors.gyro
         moving = running and sensors.accelerometer
