@@ -23,7 +23,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from mavsitl.dialect import mavlink
-from tests.durability.station import Ports, Process, Station, stop_all
+from tests.durability.station import PATIENCE_S, Ports, Process, Station, stop_all
 
 BACK_LIMIT_S = 2.5
 """From the moment that both are there again until they have one another."""
@@ -67,9 +67,11 @@ class Flight:
         self.ground = Process(*self.ports.ground("--duration", "3600", "--set", f"reference.steps={HEIGHT}"))
         return self.ground
 
-    def said(self, process: Process, text: str, since: int = 0, limit_s: float = 60.0) -> float:
+    def said(self, process: Process, text: str, since: int = 0, limit_s: float = PATIENCE_S) -> float:
         """Wait for what a process prints while the station goes on; how long that took, seconds."""
-        return self.station.until(lambda: text in process.printed[since:], limit_s, f"{text!r} in {process.printed!r}")
+        return self.station.until(
+            lambda: text in process.printed[since:], limit_s, lambda: f"{text!r} in {process.printed!r}"
+        )
 
     def flying(self, since: int = 0) -> float:
         """Wait until the ground flies the vehicle in OFFBOARD."""

@@ -231,3 +231,23 @@ def test_a_vehicle_whose_heartbeats_are_lost_is_there_as_long_as_anything_comes(
     handshake.step(13_000_001)
     assert handshake.target is None
     assert said[-1] == "vehicle lost: silent for 3 s"
+
+
+def test_a_vehicle_that_boots_is_another_flight() -> None:
+    """Killed and started again at once, it speaks before its clock can be seen: it was not disarmed by somebody."""
+    air = in_flight()
+    air.vehicle = None
+    boot = HEARTBEAT(0, 1, 1, mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 1, 0, mavlink.MAV_STATE_BOOT, 3)
+    air.ground.receive(0, boot)
+    air.run(0.1)
+    sent = len(air.from_ground)
+    for _ in range(5):
+        air.ground.receive(0, boot)
+        air.run(0.5)
+    assert air.said.count("vehicle lost: it boots") == 1
+    assert air.ground.phase == "SEARCH"
+    said = {frame.message.get_type() for datagram in air.from_ground[sent:] for frame in parse(datagram)}
+    assert said == {"HEARTBEAT"}, "nobody is commanded who boots"
+    air.start_vehicle()
+    assert air.reaches("FLY")
+    assert air.said[-1] == "flying"
