@@ -8,7 +8,7 @@ import pytest
 
 from mavsitl.dialect import mavlink
 from tests.autopilot.conftest import Client
-from tests.hostile import fields, fuzz, guided, loss, rivals
+from tests.hostile import fields, floods, fuzz, guided, loss, rivals
 from tests.hostile.attacks import HANDLED
 from tests.hostile.report import Report
 from tests.hostile.targets import TARGETS
@@ -65,6 +65,13 @@ def test_amplification() -> None:
 def test_spoofed_sources() -> None:
     report = Report("")
     rivals.spoofed(report)
+    assert failures(report) == []
+
+
+@pytest.mark.sockets
+def test_floods() -> None:
+    report = Report("")
+    floods.simulated(report)
     assert failures(report) == []
 
 
