@@ -13,15 +13,14 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from mavsitl.clock import CATCH_UP_US, LatenessHistogram, PacedClock, monotonic_us
 from mavsitl.keep import Keeper, Keeping
-from mavsitl.link.base import Link, LinkError, LinkSilent, Source
-from mavsitl.link.budget import Excess, InputBudget
+from mavsitl.link.base import Link, LinkError, LinkSilent
+from mavsitl.link.budget import Excess, FairQueue, InputBudget
 from mavsitl.link.exchange import EXCHANGE_BYTES, HELLO, pack, unpack
 from mavsitl.link.sockets import wait_any
 from mavsitl.link.udp import ConnectedUdp
@@ -511,7 +510,7 @@ class Intake:
         self._links = links
         self._tap = tap
         self._budgets = [InputBudget() for _ in links]
-        self._queues: list[deque[tuple[bytes, Source]]] = [deque() for _ in links]
+        self._queues = [FairQueue() for _ in links]
 
     @property
     def waiting(self) -> bool:
@@ -527,15 +526,14 @@ class Intake:
         vehicle = self._vehicle
         for port, link in enumerate(self._links):
             budget, queue = self._budgets[port], self._queues[port]
-            if len(queue) < READ:
-                for datagram, source in link.receive(wall_us, READ):
-                    excess = budget.take(source, wall_us)
-                    if excess is None:
-                        queue.append((datagram, source))
-                    else:
-                        vehicle.refuse(port, excess)
+            for datagram, source in link.receive(wall_us, READ):
+                excess = budget.take(source, wall_us)
+                if excess is None and not queue.put(datagram, source):
+                    excess = Excess.SOURCE
+                if excess is not None:
+                    vehicle.refuse(port, excess)
             for _ in range(min(TAKEN, len(queue))):
-                datagram, source = queue.popleft()
+                datagram, source = queue.get()
                 if port == 0:
                     self._tap.hear(Direction.FROM_GROUND, now_us, datagram)
                 if vehicle.receive(port, datagram, at_us()) and link.admit(source, wall_us):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from enum import Enum
 
 from mavsitl.link.base import Source
 from mavsitl.services.bucket import TokenBucket
 
-__all__ = ["Excess", "InputBudget"]
+__all__ = ["Excess", "FairQueue", "InputBudget"]
 
 PEER_HZ, PEER_BURST = 4000.0, 400.0
 """Datagrams of one peer. A mission that is uploaded over loopback, each item asked for, comes at 3000 a second."""
@@ -69,3 +69,39 @@ class InputBudget:
             peers.popitem(last=False)
         peers[source] = TokenBucket(PEER_HZ, PEER_BURST)
         self._strangers.pop(source, None)
+
+
+class FairQueue:
+    """Datagrams that wait, one of each source in turn: who sent many is not in the way of who sent one.
+
+    The order of each source's own datagrams stays. Of one source `MAX_WAITING` wait at most.
+    """
+
+    MAX_WAITING = 512
+
+    def __init__(self) -> None:
+        self._waiting: OrderedDict[Source, deque[bytes]] = OrderedDict()
+        self._length = 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    def put(self, datagram: bytes, source: Source) -> bool:
+        """Whether there was room for it."""
+        waiting = self._waiting.get(source)
+        if waiting is None:
+            waiting = self._waiting[source] = deque()
+        elif len(waiting) >= self.MAX_WAITING:
+            return False
+        waiting.append(datagram)
+        self._length += 1
+        return True
+
+    def get(self) -> tuple[bytes, Source]:
+        """The next one. Raises `KeyError` where none waits."""
+        source, waiting = self._waiting.popitem(last=False)
+        datagram = waiting.popleft()
+        if waiting:
+            self._waiting[source] = waiting  # behind the others
+        self._length -= 1
+        return datagram, source

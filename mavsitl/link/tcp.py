@@ -23,6 +23,9 @@ __all__ = ["MAX_CLIENTS", "MAX_PENDING_BYTES", "TcpClientLink", "TcpServerLink"]
 
 MAX_CLIENTS = 8
 
+CLIENT_SILENCE_US = 10_000_000
+"""A client that has sent nothing valid for so long gives its place to a newcomer who finds none; else it may listen."""
+
 MAX_PENDING_BYTES = 65_536
 """What is kept for a peer that does not read; with more it is let go, for old telemetry is worth nothing."""
 
@@ -49,6 +52,7 @@ class _Connection:
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self.socket = connected
         self.source = source
+        self.heard_us = 0
         self.pending = bytearray()
         self.slow = False
         self.junk = False
@@ -112,6 +116,7 @@ class TcpServerLink:
     Attributes:
         address: the local socket address, with the real port where 0 was asked for.
         clients_rejected: connections closed at once because every place was taken.
+        silent_clients: clients let go because they were silent and a newcomer needed the place.
         slow_clients: clients let go because they did not read what they were sent.
         junk_clients: clients let go because what they sent held no frames.
         accept_errors: connections that the system refused to hand over (no descriptors left).
@@ -139,6 +144,7 @@ class TcpServerLink:
         _limit_system_buffer(self._listener)  # clients inherit it
         self.address: Source = self._listener.getsockname()
         self.clients_rejected = 0
+        self.silent_clients = 0
         self.slow_clients = 0
         self.junk_clients = 0
         self.accept_errors = 0
@@ -146,6 +152,7 @@ class TcpServerLink:
         self._max_pending_bytes = max_pending_bytes
         self._clients: dict[Source, _Connection] = {}
         self._inbox: _Inbox = deque()
+        self._now_us = 0
         self._closed = False
 
     @property
@@ -163,6 +170,7 @@ class TcpServerLink:
         Raises `LinkError` after `close`.
         """
         self._check_open()
+        self._now_us = now_us
         self._pump()
         return [self._inbox.popleft() for _ in range(min(limit, len(self._inbox)))]
 
@@ -201,7 +209,10 @@ class TcpServerLink:
     def admit(self, source: Source, now_us: int) -> bool:
         """Whether `source` is connected: a client is fed as long as it is. Raises `LinkError` after `close`."""
         self._check_open()
-        return source in self._clients
+        client = self._clients.get(source)
+        if client is not None:
+            client.heard_us = now_us
+        return client is not None
 
     def close(self) -> None:
         """Close every connection and stop listening; a second call does nothing."""
@@ -242,14 +253,24 @@ class TcpServerLink:
             except OSError:
                 self.accept_errors += 1
                 return
-            if len(self._clients) >= self._max_clients:
+            if len(self._clients) >= self._max_clients and not self._make_room():
                 self.clients_rejected += 1
                 accepted.close()
                 continue
             try:
-                self._clients[source] = _Connection(accepted, source, self._max_pending_bytes)
+                client = self._clients[source] = _Connection(accepted, source, self._max_pending_bytes)
+                client.heard_us = self._now_us
             except OSError:  # it has gone already
                 accepted.close()
+
+    def _make_room(self) -> bool:
+        """Let the client go that was silent for longest, if that is long; whether there was one."""
+        silent = min(self._clients.values(), key=lambda client: client.heard_us)
+        if self._now_us - silent.heard_us <= CLIENT_SILENCE_US:
+            return False
+        self.silent_clients += 1
+        self._let_go(silent)
+        return True
 
     def _let_go(self, client: _Connection) -> None:
         self.slow_clients += client.slow

@@ -23,10 +23,18 @@ PEER_SILENCE_US = 10_000_000
 NEWCOMER_BYTES = 16_384
 """A new peer is sent no more than this until it speaks again: one forged datagram brings its victim no more."""
 
+RESERVED_BYTES = 1024
+"""The part of it that is HEARTBEAT's: a client may wait for one before it says more."""
+
 _SYSTEM_BUFFER_BYTES = 4 << 20
 """Asked for; the system gives what it allows. A flood that comes while the process sleeps pushes nobody else out."""
 
 _READ_BYTES = MAX_DATAGRAM_BYTES + 1  # one more than the parser takes: a cut datagram is still seen to be too long
+
+
+def _is_heartbeat(datagram: bytes) -> bool:
+    """A MAVLink 2 frame with the message id 0."""
+    return datagram[7:10] == b"\0\0\0" and datagram[0] == 0xFD
 
 
 class _Peer:
@@ -132,10 +140,11 @@ class UdpLink:
             self._send_to(datagram, self.remote)
         for source, peer in self._peers.items():
             if peer.allowance is not None:
-                if peer.allowance < len(datagram):
+                left = peer.allowance - len(datagram)
+                if left < (0 if _is_heartbeat(datagram) else RESERVED_BYTES):
                     self.withheld += 1
                     continue
-                peer.allowance -= len(datagram)
+                peer.allowance = left
             self._send_to(datagram, source)
 
     def admit(self, source: Source, now_us: int) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-PROGRAMS = ("fields", "rivals", "loss", "floods", "guided", "fuzz")
+PROGRAMS = ("fields", "rivals", "loss", "ground", "floods", "guided", "fuzz")
 
 
 def main() -> int:

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import dist, nan
 from time import monotonic, sleep
-from typing import Any
+from typing import Any, NamedTuple
 
 from mavsitl import pair
 from mavsitl.codec import encode, parse
@@ -27,10 +27,11 @@ from mavsitl.dialect import mavlink
 from mavsitl.link.udp import LOOPBACK
 from tests.hostile.attacks import HANDLED, Attacker, message_class
 from tests.hostile.report import Bar, Report, bar
+from tests.hostile.rivals import Wire, client, heard, wire
 
 SOURCES = 300
 FLOOD_HZ, JUNK_HZ = 5_000.0, 20_000.0
-CALM_S, FLOOD_S, PAUSE_S = 6.0, 4.0, 1.0
+CALM_S, FLOOD_S, PAUSE_S = 6.0, 4.0, 0.5
 ASK_S = 0.1
 LOST_S = 1.0
 """A command without an answer for so long is lost."""
@@ -83,14 +84,28 @@ FIELDS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def kinds() -> dict[str, tuple[float, list[bytes]]]:
-    """By name: rate and datagrams."""
-    found = {name: (FLOOD_HZ, frames(name)) for name in HANDLED if name not in QUIET}
+class Kind(NamedTuple):
+    """One flood."""
+
+    rate_hz: float
+    datagrams: list[bytes]
+    sources: int = SOURCES
+
+
+def kinds() -> dict[str, Kind]:
+    """By name."""
+    found = {name: Kind(FLOOD_HZ, frames(name)) for name in HANDLED if name not in QUIET}
+    # From one source, which is a peer and has a peer's budget.
+    for name in FROM_ONE:
+        found[f"{name}, one source"] = Kind(FLOOD_HZ, frames(name), 1)
     attacker = Attacker("flood")
-    found["hostile fields"] = (FLOOD_HZ, [attacker.frame(name) for name in HARMLESS for _ in range(100)])
-    found["junk"] = (JUNK_HZ, [random.Random(number).randbytes(64) for number in range(500)])
-    found["broken frames"] = (JUNK_HZ, [attacker.broken() for _ in range(1000)])
+    found["hostile fields"] = Kind(FLOOD_HZ, [attacker.frame(name) for name in HARMLESS for _ in range(100)])
+    found["junk"] = Kind(JUNK_HZ, [random.Random(number).randbytes(64) for number in range(500)])
+    found["broken frames"] = Kind(JUNK_HZ, [attacker.broken() for _ in range(1000)])
     return found
+
+
+FROM_ONE = ("COMMAND_LONG", "PARAM_SET", "FILE_TRANSFER_PROTOCOL", "MISSION_COUNT", "MISSION_ITEM_INT", "PING")
 
 
 HARMLESS = (
@@ -254,10 +269,9 @@ class Station:
 class Flood(threading.Thread):
     """Sends from many sockets, in bursts of a millisecond's worth, in a process of its own."""
 
-    def __init__(self, ports: Sequence[int], rate_hz: float, datagrams: Sequence[bytes], seconds: float) -> None:
+    def __init__(self, port: int, kind: Kind, seconds: float) -> None:
         super().__init__(daemon=True)
-        self._ports, self._rate_hz, self._datagrams, self._seconds = ports, rate_hz, datagrams, seconds
-        self.sent = 0
+        self._port, self._kind, self._seconds = port, kind, seconds
 
     def run(self) -> None:
         child = os.fork()
@@ -271,13 +285,13 @@ class Flood(threading.Thread):
         os.waitpid(child, 0)
 
     def _flood(self) -> None:
-        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(SOURCES)]
+        rate_hz, datagrams, sources = self._kind
+        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(sources)]
         begin = monotonic()
         sent = 0
         while (passed := monotonic() - begin) < self._seconds:
-            while sent < passed * self._rate_hz:
-                port = self._ports[sent % len(self._ports)]
-                sockets[sent % SOURCES].sendto(self._datagrams[sent % len(self._datagrams)], (LOOPBACK, port))
+            while sent < passed * rate_hz:
+                sockets[sent % sources].sendto(datagrams[sent % len(datagrams)], (LOOPBACK, self._port))
                 sent += 1
             sleep(0.001)
 
@@ -296,10 +310,9 @@ def floods(names: Sequence[str] | None = None, *, show: bool = True) -> Report:
             report.demand("calm: telemetry 1/s", "> 0", calm.rate_hz, calm.rate_hz > 0.0)
             report.demand("calm: command p99, ms", f"<= {RTT_S * 1e3:g}", 1e3 * calm.p99_s, calm.p99_s <= RTT_S)
             report.demand("calm: hover, m", "", calm.hover_m, True)
-            for name, (rate_hz, datagrams) in chosen.items():
+            for name, kind in chosen.items():
                 progress.move(0, name)
-                # Setpoints and sticks go where programs send them, the rest where ground stations are.
-                flood = Flood((station.gcs_port,), rate_hz, datagrams, FLOOD_S + 0.2)
+                flood = Flood(station.gcs_port, kind, FLOOD_S + 0.2)
                 flood.start()
                 sleep(0.1)
                 seen = station.watch(FLOOD_S)
@@ -313,7 +326,7 @@ def floods(names: Sequence[str] | None = None, *, show: bool = True) -> Report:
                 )  # fmt: skip
                 state = "crashed" if not alive else "fail-safe" if seen.critical or seen.left_mode else "flies"
                 report.demand(
-                    f"{name} {rate_hz:g}/s", "90 %, 250 ms, calm + 0.3 m, flies",
+                    f"{name} {kind.rate_hz:g}/s", "90 %, 250 ms, calm + 0.3 m, flies",
                     f"{share:.0%}, {1e3 * seen.p99_s:.0f} ms ({len(seen.round_trips_s)}/{seen.asked}), "
                     f"{seen.hover_m:.2f} m, {state}", met,
                 )  # fmt: skip
@@ -328,6 +341,85 @@ def floods(names: Sequence[str] | None = None, *, show: bool = True) -> Report:
     counted = {name: dropped.get(name, 0) for name in ("over_budget", "crowded")}
     report.demand("dropped and counted, by reason", "> 0", counted, names is not None or all(counted.values()))
     return report
+
+
+SHORT_S = 0.4
+
+
+def simulated(report: Report, names: Sequence[str] | None = None, *, seconds: float = SHORT_S) -> None:
+    """The same floods in simulated time: what arrives is weighed and counted, and no clock of the wall is looked at."""
+    chosen = {name: kind for name, kind in kinds().items() if names is None or name in names}
+    with wire() as world:
+        sources = [client() for _ in range(SOURCES)]
+        try:
+            _simulated(report, world, sources, chosen, seconds)
+        finally:
+            for opened in sources:
+                opened.close()
+
+
+def _simulated(
+    report: Report,
+    world: Wire,
+    sources: Sequence[socket.socket],
+    chosen: dict[str, Kind],
+    seconds: float,
+) -> None:
+    period_s = world.vehicle.period_us / 1e6
+
+    def say(command: int, *params: float) -> None:
+        filled = (*params, *([nan] * (7 - len(params))))
+        message = mavlink.MAVLink_command_long_message(1, 1, command, 0, *filled)
+        world.remote.sendto(encode(message, 0, *HONEST), world.gcs)
+
+    def stretch(kind: Kind, duration_s: float) -> tuple[float, float, float]:
+        """Telemetry a second, share of the questions that were answered, and the farthest from `home`, m."""
+        heard(world.remote)
+        sent = asked = ticks = 0
+        worst_m = 0.0
+
+        def each() -> None:
+            nonlocal sent, asked, ticks, worst_m
+            ticks += 1
+            while sent < ticks * period_s * kind.rate_hz:
+                sources[sent % kind.sources].sendto(kind.datagrams[sent % len(kind.datagrams)], world.gcs)
+                sent += 1
+            if ticks % 10 == 0:
+                asked += 1
+                say(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL, asked)
+            worst_m = max(worst_m, dist(world.vehicle.simulation.x[:3, 0].tolist(), home))
+
+        world.run(duration_s, each)
+        world.run(0.02)
+        messages = [frame.message for datagram in heard(world.remote) for frame in parse(datagram)]
+        answers = {m.message_id for m in messages if m.get_type() == "MESSAGE_INTERVAL"}
+        telemetry = sum(m.get_type() in STREAMS for m in messages)
+        return telemetry / duration_s, len(answers & set(range(1, asked + 1))) / asked, worst_m
+
+    home = [0.0, 0.0, 0.0]
+    world.run(0.4)
+    say(mavlink.MAV_CMD_NAV_TAKEOFF)
+    say(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+    world.run(8.0)
+    commander = world.vehicle.autopilot.commander
+    assert commander.armed, "it did not take off"
+    home = world.vehicle.simulation.x[:3, 0].tolist()
+    calm_hz, _, _ = stretch(Kind(0.0, []), 2.0)
+    for name, kind in chosen.items():
+        telemetry_hz, answered, worst_m = stretch(kind, seconds)
+        # A stretch this short cuts each stream anywhere.
+        met = (
+            telemetry_hz >= TELEMETRY_SHARE * calm_hz - 5 / seconds and answered >= 0.95 and worst_m <= HOVER_M
+            and commander.armed and commander.mode.name == "LOITER" and not commander.failsafe
+        )  # fmt: skip
+        report.demand(
+            f"{name} {kind.rate_hz:g}/s", "90 %, 95 %, 0.3 m",
+            f"{telemetry_hz:.0f} of {calm_hz:.0f}/s, {answered:.0%}, {worst_m:.2f} m", met,
+        )  # fmt: skip
+    counters = world.vehicle.counters
+    dropped = counters.over_budget + counters.crowded
+    report.demand("dropped and counted", "> 0", dropped, dropped > 0)
+    report.demand("exceptions of a handler", "0", counters.errors, counters.errors == 0)
 
 
 def main() -> int:

@@ -8,7 +8,7 @@ import pytest
 
 from mavsitl.dialect import mavlink
 from tests.autopilot.conftest import Client
-from tests.hostile import fields, fuzz, guided, loss, rivals
+from tests.hostile import fields, floods, fuzz, ground, guided, loss, rivals
 from tests.hostile.attacks import HANDLED
 from tests.hostile.report import Report
 from tests.hostile.targets import TARGETS
@@ -28,6 +28,12 @@ def test_the_list_of_handled_messages_is_the_vehicle_s() -> None:
 @pytest.mark.parametrize("seed", range(1, 6))
 def test_fuzz(seed: int, tmp_path: Path) -> None:
     assert failures(fuzz.fuzz(20_000, seed, tmp_path, show=False)) == []
+
+
+def test_the_controller_s_end() -> None:
+    report = Report("")
+    ground.ground(report, ticks=1000, show=False)
+    assert failures(report) == []
 
 
 def test_useless_floats() -> None:
@@ -65,6 +71,13 @@ def test_amplification() -> None:
 def test_spoofed_sources() -> None:
     report = Report("")
     rivals.spoofed(report)
+    assert failures(report) == []
+
+
+@pytest.mark.sockets
+def test_floods() -> None:
+    report = Report("")
+    floods.simulated(report)
     assert failures(report) == []
 
 

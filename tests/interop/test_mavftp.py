@@ -134,6 +134,14 @@ def test_get(bench: Bench, size: int, loss: float) -> None:
         assert seconds < 0.1 + size / 60_000  # no time-out anywhere
 
 
+def test_ten_kilobytes_each_way_with_a_quarter_lost(bench: Bench) -> None:
+    bench.connection.loss = 0.25
+    assert bench.put("/fs/microsd/file", content(10_000)) == 0
+    bench.connection.sleep(FtpServer.IDLE_US * 1e-6)
+    assert (bench.box / "file").read_bytes() == content(10_000)
+    assert bench.get("/fs/microsd/file")[:2] == (0, content(10_000))
+
+
 def test_gets_one_after_the_other(bench: Bench) -> None:
     for n in range(5):
         (bench.logs / str(n)).write_bytes(content(3000, n))

@@ -15,6 +15,7 @@ from mavsitl.link.budget import (
     STRANGERS_BURST,
     STRANGERS_HZ,
     Excess,
+    FairQueue,
     InputBudget,
 )
 
@@ -70,3 +71,20 @@ def test_its_tables_are_bounded() -> None:
         budget.take(source(2000 + number), number)
     assert len(budget._strangers) <= MAX_STRANGERS
     assert len(budget._peers) <= MAX_PEERS
+
+
+def test_one_of_each_source_in_turn_and_each_in_its_order() -> None:
+    queue = FairQueue()
+    for number in range(600):
+        assert queue.put(bytes((number & 0xFF,)), source(0)) == (number < FairQueue.MAX_WAITING)
+    queue.put(b"one", source(1))
+    queue.put(b"two", source(1))
+    assert len(queue) == FairQueue.MAX_WAITING + 2
+    order = [queue.get() for _ in range(5)]
+    assert order == [
+        (b"\x00", source(0)), (b"one", source(1)), (b"\x01", source(0)), (b"two", source(1)), (b"\x02", source(0)),
+    ]  # fmt: skip
+    for _ in range(FairQueue.MAX_WAITING - 3):
+        queue.get()
+    assert len(queue) == 0
+    assert not queue._waiting

@@ -13,7 +13,7 @@ from mavsitl.codec import encode
 from mavsitl.dialect import mavlink
 from mavsitl.link.base import Link, LinkError, Source
 from mavsitl.link.sockets import LOOPBACK
-from mavsitl.link.tcp import MAX_JUNK_BYTES, RETRY_US, TcpClientLink, TcpServerLink
+from mavsitl.link.tcp import CLIENT_SILENCE_US, MAX_JUNK_BYTES, RETRY_US, TcpClientLink, TcpServerLink
 
 pytestmark = pytest.mark.sockets
 
@@ -164,6 +164,19 @@ def test_the_number_of_clients_is_bounded_and_nobody_is_pushed_out(made: Made) -
     until(server, lambda: len(server.peers) == 1)
     made.plain(server)
     assert len(server.peers) == 2
+
+
+def test_a_silent_client_keeps_its_place_until_somebody_needs_it(made: Made) -> None:
+    """Else eight connections that say nothing would keep every ground station out."""
+    server = made.server(max_clients=2)
+    speaks, silent = made.plain(server), made.plain(server)
+    server.receive(CLIENT_SILENCE_US + 1)
+    assert len(server.peers) == 2
+    assert server.admit(speaks.getsockname(), CLIENT_SILENCE_US + 1)
+    newcomer = made.plain(server)
+    assert server.peers == (speaks.getsockname(), newcomer.getsockname())
+    assert ended(silent)
+    assert (server.silent_clients, server.clients_rejected) == (1, 0)
 
 
 def test_a_client_that_does_not_read_is_let_go_and_the_others_miss_nothing(made: Made) -> None:
