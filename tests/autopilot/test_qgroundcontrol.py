@@ -37,7 +37,12 @@ MODE_S, ARM_S = 1.3, 1.5
 """Within that the HEARTBEAT has to show what was asked for."""
 MOST_MESSAGES_HZ = 150.0
 LINK_SETTINGS = ("BURST", "BW", "CORR", "DIR", "DOWN", "DUP", "GOOD", "JIT", "LAT", "LOSS", "REORD")
-VOLATILE = ("COM_FLIGHT_UUID", *(f"SIM_{link}_{name}" for link in ("LINK", "GLINK") for name in LINK_SETTINGS))
+VOLATILE = (
+    "COM_FLIGHT_UUID", "SIM_CPU_STALL", "SIM_CLK_JUMP", "SIM_GUST_TRIG", "SIM_FAIL_GYRO", "SIM_FAIL_ACC",
+    "SIM_FAIL_MAG", "SIM_FAIL_BARO", "SIM_FAIL_GPS", "SIM_FAIL_BAT", "SIM_FAIL_RC", "SIM_FAIL_LINK1", "SIM_FAIL_LINK2",
+    *(f"SIM_FAIL_MOT{motor}" for motor in range(1, 5)), *(f"SIM_MOT{motor}_EFF" for motor in range(1, 5)),
+    *(f"SIM_{link}_{name}" for link in ("LINK", "GLINK") for name in LINK_SETTINGS),
+)  # fmt: skip
 """In the list and not in the hash."""
 
 LOITER, TAKEOFF, RTL, LAND = 3, 2, 5, 6

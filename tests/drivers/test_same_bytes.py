@@ -22,7 +22,7 @@ def test_two_processes_put_the_same_bytes_on_the_wire(name: str, tmp_path: Path)
     events: list[tuple[str, dict[str, Any]]] = []
     result = pair.fly(name, ["duration_s=2.0"], tmp_path, lambda end, event: events.append((end, event)))
     assert result.vehicle["finished"] is True
-    assert result.ground["finished"] is True
+    assert result.ground["finished"] is (name != "rotor-failure")  # which falls while it lands
     assert result.vehicle["wire_hash"] == result.ground["wire_hash"] == in_memory
     assert ("ground", {"event": "report", "text": "flying"}) in events
 
