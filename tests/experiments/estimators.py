@@ -71,10 +71,13 @@ and nothing in it is changed here.
 - *{rtk}*: the same with 1 cm of noise and of slow error and 2 cm/s in velocity.
 
 {tables}
-The controller holds the estimate to the reference as well as before; the truth is off by what the filter does not see.
+The controller holds the estimate to the reference as well as before; the truth is off by what the filter does not
+see.
 With GPS that is a walk of the position, mostly from the receiver's velocity noise, with the slow error to bound it. It
 stays below that error's sigma because the filter knows the sensors' statistics exactly, and because a receiver's
-velocity has no slow error here; a real one's are worse on both counts.
+velocity has no slow error here; a real one's are worse on both counts. The angles' error is the heading's most of all:
+what is left of the magnetometer's offset shows only once the vehicle has moved, so it is largest in calm air, where it
+hovers.
 {failed}"""
 
 
