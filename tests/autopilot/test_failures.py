@@ -494,8 +494,9 @@ ANSWERS: list[tuple[tuple[float, ...], int, str]] = [
     ((nan, 1, 0), DENIED, "Failure injection refused: param1 is nan, need a FAILURE_UNIT"),
     ((101.5, 1, 0), DENIED, "Failure injection refused: param1 is 101.5, need a FAILURE_UNIT"),
     ((101, inf, 0), DENIED, "Command 420 refused: param2 is inf"),
-    ((101, 1, nan), DENIED, "Failure injection refused: param3 is nan, need an instance, 0 for all"),
-    ((101, 1, 0.5), DENIED, "Failure injection refused: param3 is 0.5, need an instance, 0 for all"),
+    ((101, 1, nan), DENIED, "Failure injection refused: param3 is nan, need 0 (all) or more"),
+    ((102, 1, nan), UNSUPPORTED, "Failure injection refused: unit 102 type 1 is not supported"),
+    ((101, 1, 0.5), DENIED, "Failure injection refused: param3 is 0.5, need 0 (all) or more"),
     ((101, 1, 5), DENIED, "Failure injection refused: motor has no instance 5; allowed: 0 (all) to 4"),
     ((101, 1, -1), DENIED, "Failure injection refused: motor has no instance -1; allowed: 0 (all) to 4"),
     ((100, 1, 2), DENIED, "Failure injection refused: battery has no instance 2; allowed: 0 (all) to 1"),
@@ -674,3 +675,21 @@ def test_on_the_ground_no_gust_begins() -> None:
     client.tick()
     assert client.vehicle.parameters["SIM_GUST_TRIG"] == 0
     assert client.texts()[-1] == "SIM_GUST_TRIG: the vehicle is not flying"
+
+
+@pytest.mark.parametrize(("name", "value"), [("SIM_CPU_STALL", 0.5), ("SIM_FAIL_LINK1", int(Kind.OFF))])
+def test_in_lock_step_over_a_perfect_link_nothing_falls_silent(name: str, value: float) -> None:
+    """The ground would wait for the tick's telemetry, and the vehicle for the answer to it."""
+    vehicle = Vehicle(flight(), NullRecorder(), seed=1, lockstep=True)
+    refused = vehicle.parameters.set(name, value)
+    assert refused is not None
+    assert (
+        refused.text == f"{name}: in lock-step it needs an impaired [link]: over a perfect one time goes by telemetry"
+    )
+    lossy = Vehicle(flight(link__to_ground__queue_bytes=9000), NullRecorder(), seed=1, lockstep=True)
+    assert lossy.parameters.set(name, value) is None
+    client = Client(flight())
+    client.vehicle.parameters.put("SYS_FAILURE_EN", 1)
+    client.vehicle.autopilot.may_fall_silent = False
+    assert client.result(INJECT, LINK, Kind.OFF, 1) == DENIED
+    assert client.result(INJECT, LINK, Kind.STUCK, 1) == ACCEPTED

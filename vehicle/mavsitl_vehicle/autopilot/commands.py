@@ -411,13 +411,14 @@ def _inject_failure(autopilot: Autopilot, command: Command, now_us: int, port: P
     if not autopilot.parameters["SYS_FAILURE_EN"]:
         return _deny(autopilot, "Failure injection refused: SYS_FAILURE_EN is 0")
     unit, kind, instance = (command.integer(index) for index in (1, 2, 3))
-    if unit is None or kind is None or instance is None:
-        needed = ("a FAILURE_UNIT", "a FAILURE_TYPE", "an instance, 0 for all")
-        index = next(index for index in (1, 2, 3) if command.integer(index) is None)
-        value = command.params[index - 1]
-        return _deny(autopilot, f"Failure injection refused: param{index} is {value:g}, need {needed[index - 1]}")
+    if unit is None:
+        return _deny(autopilot, f"Failure injection refused: param1 is {command.params[0]:g}, need a FAILURE_UNIT")
+    if kind is None:
+        return _deny(autopilot, f"Failure injection refused: param2 is {command.params[1]:g}, need a FAILURE_TYPE")
     if problem := failures.unsupported(unit, kind, sensors=autopilot.has_sensors):
         return _deny(autopilot, f"Failure injection refused: {problem}", UNSUPPORTED)
+    if instance is None:
+        return _deny(autopilot, f"Failure injection refused: param3 is {command.params[2]:g}, need 0 (all) or more")
     problem = failures.instance_problem(Unit(unit), instance)
     if failures.silences(unit, kind) and not autopilot.may_fall_silent:
         problem = failures.NO_SILENCE
