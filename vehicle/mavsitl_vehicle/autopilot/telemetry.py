@@ -241,8 +241,8 @@ class Frozen:
     """
 
     _KEPT = (
-        "estimate", "accuracy", "estimator_status", "readings", "truth", "true_wind", "outputs", "specific_force_flu_m_s2",
-        "health", "attitude_target", "position_target", "wind", "sticks",
+        "estimate", "accuracy", "estimator_status", "readings", "truth", "true_wind", "outputs",
+        "specific_force_flu_m_s2", "health", "attitude_target", "position_target", "wind", "sticks",
     )  # fmt: skip
 
     def __init__(self, subject: Subject) -> None:
