@@ -97,7 +97,6 @@ def vehicle(
             thread.join(STOP_S)
             if thread.is_alive():
                 raise RuntimeError(f"the vehicle did not stop within {STOP_S:g} s")
-            core.close()
         if failures:
             raise failures[0]
     finally:

@@ -17,6 +17,7 @@ from mavsitl_vehicle.autopilot.setpoints import RateSetpoint
 from mavsitl_vehicle.failures import (
     EFFICIENCIES,
     INSTANCES,
+    NO_SILENCE,
     SENSORS,
     SIZES,
     TABLE,
@@ -683,9 +684,7 @@ def test_in_lock_step_over_a_perfect_link_nothing_falls_silent(name: str, value:
     vehicle = Vehicle(flight(), NullRecorder(), seed=1, lockstep=True)
     refused = vehicle.parameters.set(name, value)
     assert refused is not None
-    assert (
-        refused.text == f"{name}: in lock-step it needs an impaired [link]: over a perfect one time goes by telemetry"
-    )
+    assert refused.text == f"{name}: {NO_SILENCE}"
     lossy = Vehicle(flight(link__to_ground__queue_bytes=9000), NullRecorder(), seed=1, lockstep=True)
     assert lossy.parameters.set(name, value) is None
     client = Client(flight())

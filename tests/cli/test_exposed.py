@@ -11,6 +11,7 @@ from mavsitl import ends
 from mavsitl.cli import main
 from mavsitl.codec import encode
 from mavsitl.ends import ExposedError, NullRecorder, VehicleLinks
+from mavsitl.keep import carry_out
 from mavsitl.scenario import load
 from mavsitl.signing import EPOCH_UNIX_US, Key, setup_signing
 
@@ -80,6 +81,7 @@ def test_a_vehicle_with_a_key_and_the_demand_is_signed_only(tmp_path: Path) -> N
     assert at_home.parameters.set("MAV_SIGN_CFG", 1) is None
     assert not at_home.signed_only  # 1 leaves out the links on loopback
     at_home.close()
+    carry_out(at_home)
     abroad = vehicle(trusted=False)
     assert abroad.signed_only
     abroad.close()
