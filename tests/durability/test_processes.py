@@ -6,7 +6,7 @@ import random
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -115,6 +115,14 @@ def wait_gone(pids: list[int]) -> None:
     while not all(gone(pid) for pid in pids):
         assert monotonic() < until_s, f"still there: {[pid for pid in pids if not gone(pid)]}"
         sleep(0.05)
+
+
+@pytest.fixture(autouse=True)
+def terminal() -> Iterator[None]:
+    """Processes do not begin under nohup, whatever runs the tests."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 def flying(folder: Path) -> subprocess.Popen[bytes]:
