@@ -52,7 +52,8 @@ MAX_TEXTS = 50
 ANSWERS_HZ, ANSWERS_BURST = 2.0, 10.0
 """Texts of one kind that commands, modes and plans are answered by."""
 LOOK_US = 20_000
-"""So often the commander decides (PX4's: every 10 ms at most). A command, or a stream that returns, makes it look at once."""
+"""So often the commander decides; PX4's at most every 10 ms. A command, or a stream that returns, makes it look at
+once."""
 WATCH_US = 40_000
 """So often fence, plan and the way back are looked at in flight."""
 HOUSEKEEPING_US = 100_000
