@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from statistics import median
-from time import perf_counter
+from time import process_time
 
 from mavsitl_vehicle.autopilot.parameters import Parameters
 from mavsitl_vehicle.simulation import Simulation
@@ -21,15 +21,15 @@ KINDS = ("white-noise", "ekf")
 
 
 def period_us(kind: str, periods: int) -> float:
-    """Microseconds of one control period of the simulation, aligned, in the clamp."""
+    """Microseconds of the processor's time for one control period of the simulation, aligned, in the clamp."""
     flight = scenario.load(SCENARIO, {"estimator.kind": kind})
     simulation = Simulation(flight, Parameters(flight.airframe.parameters, flight.scenario.parameters), 1)
     for _ in range(250):
         simulation.advance(-1.0)
-    started = perf_counter()
+    started = process_time()
     for _ in range(periods):
         simulation.advance(-1.0)
-    return (perf_counter() - started) / periods * 1e6
+    return (process_time() - started) / periods * 1e6
 
 
 def speed(kind: str, duration_s: float) -> float:

@@ -106,8 +106,9 @@ def test_without_imu_samples_the_estimate_is_not_valid_at_once(unit: Unit, inval
     assert {name for name in names if not getattr(rig.status, name)} == invalid
     assert not (rig.status.sensors.gyro if unit is Unit.GYRO else rig.status.sensors.accelerometer)
     rig.break_(unit, Kind.OK)
-    rig.rest(0.1)
+    rig.rest(1.0)
     assert all(getattr(rig.status, name) for name in names)
+    assert np.abs(rig.position_error).max() < 0.2
 
 
 # --- GPS, barometer, magnetometer: what comes
@@ -216,3 +217,34 @@ def test_gps_garbage_is_refused() -> None:
     rig.break_(Unit.GPS, Kind.GARBAGE)
     rig.fly(5.0)
     assert np.abs(rig.position_error).max() < 3.0
+
+
+def test_an_accelerometer_that_returns_is_caught_by_gps() -> None:
+    """It says free fall for a while, and the velocity runs off; with its first fix GPS has it again."""
+    rig = up()
+    rig.break_(Unit.ACCEL, Kind.OFF)
+    rig.sensed.imu.state[imu.ACCEL : imu.ACCEL + 3] = 0.0
+    rig.fly(0.5)
+    assert not rig.status.position_valid
+    assert abs(rig.simulation.estimate[5, 0] - rig.simulation.x[5, 0]) > 0.5
+    rig.break_(Unit.ACCEL, Kind.OK)
+    rig.fly(0.5)
+    assert rig.status.position_valid
+    assert np.abs(rig.simulation.estimate[3:6, 0] - rig.simulation.x[3:6, 0]).max() < 0.2
+    rig.fly(3.0)
+    assert np.abs(rig.position_error).max() < 0.6
+
+
+@pytest.mark.parametrize("unit", sorted(SENSORS))
+@pytest.mark.parametrize("kind", [kind for kind in Kind if kind is not Kind.OK])
+def test_whatever_fails_the_filter_stays_finite(unit: Unit, kind: Kind) -> None:
+    """In the air, and often soon on the ground: no exception, no NaN, a covariance that is still one."""
+    rig = up()
+    rig.break_(unit, kind)
+    rig.fly(8.0)
+    rig.break_(unit, Kind.OK)
+    rig.fly(1.0)
+    p = rig.sensed.p[:, :, 0]
+    assert np.isfinite(rig.simulation.estimate).all()
+    scale = 1.0 / np.sqrt(np.diagonal(p))
+    assert np.linalg.eigvalsh(p * np.outer(scale, scale)).min() > 0.0

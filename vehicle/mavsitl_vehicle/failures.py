@@ -53,7 +53,7 @@ TABLE: Mapping[tuple[Unit, Kind], str] = {
     (Unit.GYRO, Kind.OFF): "No samples: rate loop and filter keep the last one; the attitude is not valid after 0.1 s.",
     (Unit.GYRO, Kind.STUCK): "Rate loop and filter see the value of that moment for ever; nothing notices.",
     (Unit.GYRO, Kind.GARBAGE): "Noise of 10 rad/s (1 sigma).",
-    (Unit.GYRO, Kind.WRONG): "20 deg/s too much about each axis.",
+    (Unit.GYRO, Kind.WRONG): "20 deg/s too much about each axis: the rate loop turns the vehicle the other way.",
     (Unit.GYRO, Kind.SLOW): "50 samples a second.",
     (Unit.GYRO, Kind.DELAYED): "20 ms late.",
     (Unit.GYRO, Kind.INTERMITTENT): "Each 50 ms there or not, as a coin falls; the last sample is kept meanwhile.",
@@ -83,7 +83,7 @@ TABLE: Mapping[tuple[Unit, Kind], str] = {
     (Unit.GPS, Kind.OFF): "No fixes: dead reckoning; velocity and position are not valid after EKF2_NOAID_TOUT.",
     (Unit.GPS, Kind.STUCK): "The fix of that moment for ever, velocity too, with new stamps.",
     (Unit.GPS, Kind.GARBAGE): "Noise of 50 m and 5 m/s (1 sigma) that the receiver does not tell of; "
-    "most of it is refused at the gates.",
+    "most of it is refused at the gates, and one is believed after 7 s.",
     (Unit.GPS, Kind.WRONG): "20 m north, 20 m west and 10 m up of the truth: refused, and believed after 7 s. "
     "SIM_GPS_GLITCH_* have any other offset.",
     (Unit.GPS, Kind.SLOW): "One fix in ten.",

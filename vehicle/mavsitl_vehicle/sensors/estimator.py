@@ -31,6 +31,8 @@ START_POSITION_M = 0.01
 """1 sigma of the start pose, which is where the local frame is."""
 WIDE = 5.0
 """The attitude of the alignment is taken for so many times as uncertain before gravity and field are fused with it."""
+WILD = 5.0
+"""A GPS offset of more sigma than this is none: what went wrong before a reset is in it."""
 UNKNOWN_M = 1e3
 UNKNOWN_M_S = 30.0
 UNKNOWN_GAUSS = 0.5
@@ -39,6 +41,8 @@ LEAST_GYRO_NOISE, LEAST_ACCEL_NOISE = 1e-6, 1e-5
 LEAST_NOISE, LEAST_MAG_NOISE = 1e-3, 1e-4
 """The filter takes no sensor for better than this, m or m/s, gauss: exact ones would leave it no covariance."""
 
+LOST_ATTITUDE_RAD = 0.3
+"""After a gap in the gyro's samples."""
 USED_SATELLITES = 6
 """EKF2_REQ_NSATS: a fix of fewer is not used."""
 IMU_TIMEOUT_US = 100_000
@@ -174,8 +178,13 @@ class SensedEstimator:
         self.now_us += self.period_us
         now_us, state = self.now_us, self.imu.state
         if state[imu.FRESH, 0] > 0.0:
+            if now_us - self._gyro_us > IMU_TIMEOUT_US:
+                ekf.forget(self.p, ekf.E_ATTITUDE, 3, LOST_ATTITUDE_RAD**2)
             self._gyro_us = now_us
         if state[imu.FRESH + 1, 0] > 0.0:
+            if now_us - self._accel_us > IMU_TIMEOUT_US:
+                ekf.forget(self.p, ekf.E_VELOCITY, 3, UNKNOWN_M_S**2)
+                ekf.forget(self.p, ekf.E_POSITION, 3, UNKNOWN_M**2)
             self._accel_us = now_us
         delta = state[imu.DELTA : imu.DELTA + 6]
         ekf.advance(
@@ -387,6 +396,12 @@ class SensedEstimator:
             ekf.forget(p, ekf.E_VELOCITY, 3, UNKNOWN_M_S**2)
         elif test == GPS_POSITION:
             ekf.forget(p, ekf.E_POSITION, 2, UNKNOWN_M**2)
+            if (
+                np.abs(self.x[ekf.GPS_OFFSET : ekf.GPS_OFFSET + 2, j]).max()
+                > WILD * self._settings.gps.horizontal_drift_m
+            ):
+                self.x[ekf.GPS_OFFSET : ekf.GPS_OFFSET + 2, j] = 0.0
+                ekf.forget(p, ekf.E_GPS_OFFSET, 2, self.process[ekf.GPS_DRIFT_H])
         else:
             other, offset = (BARO, ekf.E_GPS_OFFSET + 2) if test == GPS_HEIGHT else (GPS_HEIGHT, ekf.E_BARO_OFFSET)
             if self.now_us - self.fused_us[other, j] <= DEAD_RECKONING_US:
