@@ -141,6 +141,8 @@ class Figures:
         return times[min(len(times) - 1, int(0.99 * len(times)))] if times else LOST_S
 
 
+HOLD_WITHOUT_STICKS = 2
+"""COM_RCL_EXCEPT: a flood of MANUAL_CONTROL that ends is else a lost stick, with a fail-safe of its own."""
 STREAMS = frozenset({"ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ALTITUDE"})
 """Telemetry that comes unasked at a steady rate: what is counted."""
 
@@ -166,6 +168,7 @@ class Station:
                 sys.executable, "-m", "mavsitl", "vehicle", "--no-state", "--status", "json",
                 "--offboard-port", str(ports[0]), "--offboard-remote", f"{LOOPBACK}:{ports[2]}",
                 "--gcs-port", str(ports[1]), "--gcs-remote", f"{LOOPBACK}:{ports[3]}",
+                "--set", f"parameters.COM_RCL_EXCEPT={HOLD_WITHOUT_STICKS}",
             ],
             stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
@@ -397,6 +400,7 @@ def _simulated(
         return telemetry / duration_s, len(answers & set(range(1, asked + 1))) / asked, worst_m
 
     home = [0.0, 0.0, 0.0]
+    world.vehicle.parameters.put("COM_RCL_EXCEPT", HOLD_WITHOUT_STICKS)
     world.run(0.4)
     say(mavlink.MAV_CMD_NAV_TAKEOFF)
     say(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)

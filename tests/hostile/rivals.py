@@ -23,6 +23,7 @@ from mavsitl.codec import encode, parse
 from mavsitl.dialect import mavlink
 from mavsitl.drivers import Intake, Tap
 from mavsitl.ends import NullRecorder
+from mavsitl.keep import carry_out
 from mavsitl.link.udp import LOOPBACK, MAX_PEERS, UdpLink
 from mavsitl.services.ftp import DATA_BYTES, FtpError, FtpPayload, Opcode
 from mavsitl.signing import EPOCH_UNIX_US, Key, setup_signing
@@ -340,6 +341,7 @@ def traversal(report: Report, folder: Path) -> None:
     sizes = sum(m.count for m in data)
     report.demand("bytes for 4 GiB of a log of 10000", "10000", sizes, sizes == 10_000)
 
+    carry_out(files.vehicle)
     secrecy(report, files)
     files.vehicle.close()
 
