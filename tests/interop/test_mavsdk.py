@@ -333,6 +333,7 @@ def test_reboot(pilot: Pilot) -> None:
         first(times, lambda fields: fields["time_boot_ms"] < before, PATIENCE_S, "a clock that begins anew")
     pilot.wait("health_all_ok", bool)
     pilot.action.arm()
+    pilot.wait("armed", bool)
 
 
 # --- off-board -------------------------------------------------------------------------------------------------------
