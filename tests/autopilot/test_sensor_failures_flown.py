@@ -56,6 +56,23 @@ def test_without_gps_it_descends_lands_and_disarms_within_30_s() -> None:
     assert "Failsafe activated: position estimate lost, descend" in client.texts()
 
 
+def test_a_position_known_worse_than_the_limit_is_lost_and_must_be_better_to_return() -> None:
+    client = hovering()
+    known_m = client.vehicle.autopilot.estimator_status.eph_m
+    client.vehicle.parameters.put("COM_POS_FS_EPH", known_m / 2.0)  # 2.5 times of it are allowed to what is known
+    client.run(0.5)
+    assert client.vehicle.autopilot.commander.mode is Mode.LOITER
+    client.vehicle.parameters.put("COM_POS_FS_EPH", known_m / 3.0)
+    client.run(0.5)
+    assert client.vehicle.autopilot.commander.mode is Mode.DESCEND
+    client.vehicle.parameters.put("COM_POS_FS_EPH", known_m / 2.0)
+    client.run(0.5)
+    assert not client.vehicle.autopilot.valid.position
+    client.vehicle.parameters.put("COM_POS_FS_EPH", known_m * 1.5)
+    client.run(0.5)
+    assert client.vehicle.autopilot.valid.position
+
+
 def test_gps_that_returns_gives_the_position_back() -> None:
     client = hovering()
     client.vehicle.failures.set(Unit.GPS, Kind.OFF)

@@ -54,6 +54,8 @@ ANSWERS_HZ, ANSWERS_BURST = 2.0, 10.0
 LOOK_US = 20_000
 """So often the commander decides; PX4's at most every 10 ms. A command, or a stream that returns, makes it look at
 once."""
+KNOWN_FACTOR = 2.5
+"""PX4: what is known may become so much worse than what is to be known anew."""
 WATCH_US = 40_000
 """So often fence, plan and the way back are looked at in flight."""
 HOUSEKEEPING_US = 100_000
@@ -305,9 +307,21 @@ class Autopilot:
         if status is not self._status:
             self._status = status
             self.accuracy = telemetry.accuracy(status)
-            self.valid = Validity(
-                status.attitude_valid, status.height_valid, status.velocity_valid, status.position_valid
-            )
+            self.valid = self._validity(status)
+
+    def _validity(self, status: EstimatorStatus) -> Validity:
+        """As the estimator says, within COM_VEL_FS_EVH and COM_POS_FS_EPH."""
+        p, before = self.parameters, self.valid
+        velocity_m_s, position_m = (
+            p[name] * (KNOWN_FACTOR if known_before else 1.0)
+            for name, known_before in (("COM_VEL_FS_EVH", before.velocity), ("COM_POS_FS_EPH", before.position))
+        )
+        return Validity(
+            status.attitude_valid,
+            status.height_valid,
+            status.velocity_valid and status.evh_m_s <= velocity_m_s,
+            status.position_valid and (position_m < 0.0 or status.eph_m <= position_m),
+        )
 
     @property
     def at_rest(self) -> bool:

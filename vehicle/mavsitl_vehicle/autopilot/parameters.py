@@ -298,6 +298,10 @@ _ROWS: Iterable[tuple[Parameter, ...]] = (
         _choice("COM_WIND_MAX_ACT", 0, {0: "None", 1: "Warn", 2: "Hold", 3: "Return", 4: "Terminate", 5: "Land"},
                 "What follows more wind than COM_WIND_MAX"),
         _real("COM_WIND_WARN", -1, -1, 100, "m/s", "Wind that is warned of; negative: none", decimals=1),
+        _real("COM_POS_FS_EPH", 5, -1, 400, "m", "1 sigma of the position beyond which it is lost; negative: no limit",
+              "Once it is known, up to 2.5 times of it.", decimals=0),
+        _real("COM_VEL_FS_EVH", 1, 0, 10, "m/s", "1 sigma of the horizontal velocity beyond which it is lost",
+              "Once it is known, up to 2.5 times of it.", decimals=1),
         _real("COM_POS_LOW_EPH", -1, -1, 1000, "m", "1 sigma of the position that COM_POS_LOW_ACT answers; negative: "
               "none", "In Hold and missions.", decimals=1),
         _choice("COM_POS_LOW_ACT", 3, {0: "None", 1: "Warn", 2: "Hold", 3: "Return", 4: "Terminate", 5: "Land"},
