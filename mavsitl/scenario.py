@@ -320,6 +320,16 @@ class Failure(Section, frozen=True):
     """How much, where the reference has a number for it; else its default."""
 
 
+class ParameterChange(Section, frozen=True):
+    """Parameters of the vehicle are set at `at_s`: what PARAM_SET does, by the scenario's time line."""
+
+    at_s: NonNegative
+    parameters: dict[str, float]
+    """E.g. `SIM_GUST_TRIG = 1`, `SIM_CPU_STALL = 0.5`; one that the vehicle refuses then is said and left."""
+    clock: Literal["flight", "simulated"] = "flight"
+    """Of `at_s`: since the release or the lift-off, or since the vehicle's start."""
+
+
 class Hover(Section, frozen=True, tag_field="kind", tag="hover"):
     position_nwu_m: Vector3 = (0.0, 0.0, 1.0)
     yaw_deg: float = 0.0
@@ -450,6 +460,8 @@ class Scenario(Section, frozen=True):
     """What the vehicle does wrong on its MAVLink ports."""
     failures: tuple[Failure, ...] = ()
     """What breaks, and when."""
+    parameter_changes: tuple[ParameterChange, ...] = ()
+    """What else happens, and when."""
     parameters: dict[str, float] = {}
     """PX4 parameters of the vehicle, over the airframe's."""
     controller: Controller = Controller()

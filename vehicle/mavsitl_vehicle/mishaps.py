@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import inf
 from typing import TYPE_CHECKING
 
-from mavsitl.scenario import Gust, ScenarioError
+from mavsitl.scenario import Flight, Gust, ScenarioError
 from mavsitl_vehicle import failures
-from mavsitl_vehicle.autopilot.parameters import TABLE
+from mavsitl_vehicle.autopilot.parameters import TABLE, Parameters, checked
 from mavsitl_vehicle.failures import Change, Kind, Unit
 from mavsitl_vehicle.wind.field import mil_axes
 
@@ -17,6 +18,41 @@ if TYPE_CHECKING:
 HAPPENINGS = ("SIM_CPU_STALL", "SIM_CLK_JUMP", "SIM_GUST_TRIG")
 EVENTS = (*failures.PARAMETERS, *failures.EFFICIENCIES, *HAPPENINGS)
 """Parameters that make something happen when they are set."""
+
+
+class ParameterTimeline:
+    """Sets the scenario's parameters when their time comes; those by the flight's time again in each flight."""
+
+    def __init__(self, flight: Flight, parameters: Parameters, warn: Callable[[str], None]) -> None:
+        """Raises `ScenarioError` for a name or a value that there is not."""
+        self._parameters = parameters
+        self._warn = warn
+        self._changes = [
+            (change, {name: checked(f"{flight.name}: parameter_changes[{number}].", name, value)
+                      for name, value in change.parameters.items()})
+            for number, change in enumerate(flight.scenario.parameter_changes)
+        ]  # fmt: skip
+        self._done: set[int] = set()
+        self._last_flight_s = -1.0
+
+    def __bool__(self) -> bool:
+        return bool(self._changes)
+
+    def step(self, now_us: int, flight_time_s: float) -> None:
+        """What is due by `now_us` since the start; the flight's time is negative before the release."""
+        if flight_time_s < 0.0 <= self._last_flight_s:
+            self._done = {number for number in self._done if self._changes[number][0].clock == "simulated"}
+        self._last_flight_s = flight_time_s
+        for number, (change, values) in enumerate(self._changes):
+            time_s = flight_time_s if change.clock == "flight" else now_us * 1e-6
+            if number not in self._done and time_s >= 0.0 and time_s + HALF_US >= change.at_s:
+                self._done.add(number)
+                for name, value in values.items():
+                    if refused := self._parameters.set(name, value):
+                        self._warn(refused.text)
+
+
+HALF_US = 0.5e-6
 
 
 class Mishaps:

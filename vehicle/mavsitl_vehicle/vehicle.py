@@ -31,7 +31,7 @@ from mavsitl_vehicle.autopilot.storage import Store, keep_parameters
 from mavsitl_vehicle.autopilot.wind_estimate import WindEstimate
 from mavsitl_vehicle.failures import Change, Failures, Kind, Timeline
 from mavsitl_vehicle.links import LinkControl, initial_links
-from mavsitl_vehicle.mishaps import Mishaps
+from mavsitl_vehicle.mishaps import Mishaps, ParameterTimeline
 from mavsitl_vehicle.record import Record
 from mavsitl_vehicle.sensors.status import Readings
 from mavsitl_vehicle.simulation import Simulation
@@ -111,6 +111,7 @@ class Vehicle:
         self.links = LinkControl(self.parameters, self.failures, flight.scenario, lockstep=lockstep)
         self.parameters.subscribe(self._on_parameter)
         self._mishaps = Mishaps(self)
+        self._changes = ParameterTimeline(flight, self.parameters, self.warn)
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
         self._record = Record(recorder, flight, aboard=self._seated is not None)
@@ -306,6 +307,8 @@ class Vehicle:
         first = self._now_us < 0
         if self._timeline:
             self._timeline.step(self._now_us, self.flight_time_s)
+        if self._changes:
+            self._changes.step(self._now_us, self.flight_time_s)
         self._now_us = now_us
         if self._chaos is not None:
             self._chaos.step(now_us, self.flight_time_s)

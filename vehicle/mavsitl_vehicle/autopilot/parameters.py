@@ -634,7 +634,7 @@ class Parameters:
         for layer in layers:
             source, values = layer if isinstance(layer, Layer) else ("", layer)
             for name, value in values.items():
-                self._defaults[name] = _checked(f"{source}: " if source else "", name, value)
+                self._defaults[name] = checked(f"{source}: " if source else "", name, value)
         self._values = dict(self._defaults)
 
     def __getitem__(self, name: str) -> float:
@@ -751,7 +751,8 @@ def _packed(row: Parameter, value: float) -> bytes:
     return struct.pack("<i" if row.is_integer else "<f", value)
 
 
-def _checked(where: str, name: str, value: float) -> float:
+def checked(where: str, name: str, value: float) -> float:
+    """The value as the table has it. Raises `ScenarioError`, which begins with `where`, if it does not allow it."""
     row = TABLE.get(name)
     if row is None:
         raise ScenarioError(f"{where}parameters.{name}: no such parameter; known: {', '.join(TABLE)}")
