@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from mavsitl.dialect import mavlink
 from mavsitl.scenario import Failure, Flight, Scenario, ScenarioError
+from mavsitl_vehicle.schedule import Schedule
 
 
 class Unit(IntEnum):
@@ -152,8 +153,7 @@ def kinds(unit: Unit) -> tuple[Kind, ...]:
 
 def has_sensors(scenario: Scenario) -> bool:
     """Does the vehicle estimate its state from sensors, which can fail?"""
-    estimator = getattr(scenario, "estimator", None)
-    return estimator is not None and estimator.kind == "ekf"
+    return scenario.estimator.kind == "ekf"
 
 
 NO_SILENCE = "in lock-step it needs an impaired [link], e.g. link.live: over a perfect one time goes by telemetry"
@@ -175,8 +175,8 @@ def unsupported(unit: int, kind: int, *, sensors: bool) -> str | None:
         return f"unit {unit} type {kind} is not supported"
     if Unit(unit) in SENSORS and not sensors:
         return f'{named(Unit(unit))} needs estimator.kind = "ekf"'
-    if (known := kinds(Unit(unit))) == (Kind.OK,) or kind not in known:
-        allowed = ", ".join(f"{each.value} {named(each)}" for each in known) if len(known) > 1 else "none"
+    if kind not in (known := kinds(Unit(unit))):
+        allowed = ", ".join(f"{each.value} {named(each)}" for each in known)
         return f"{named(Unit(unit))} {named(Kind(kind))} is not supported; allowed: {allowed}"
     return None
 
@@ -279,27 +279,20 @@ class Timeline:
         """Raises `ScenarioError` for a failure that there is not."""
         self._failures = failures
         self._planned = [_Planned(flight, number, lockstep) for number in range(len(flight.scenario.failures))]
-        self._last_flight_s = -1.0
+        self._schedule = Schedule((planned.asked.start_s, planned.asked.clock) for planned in self._planned)
 
     def __bool__(self) -> bool:
         return bool(self._planned)
 
     def step(self, now_us: int, flight_time_s: float) -> None:
         """What begins or ends by `now_us` since the start; the flight's time is negative before the release."""
-        if flight_time_s < 0.0 <= self._last_flight_s:
-            for planned in self._planned:
-                planned.done = planned.done and planned.asked.clock == "simulated"
-        self._last_flight_s = flight_time_s
-        for planned in self._planned:
+        due = self._schedule.due(now_us, flight_time_s)
+        for number, planned in enumerate(self._planned):
             if planned.ends_us <= now_us:
                 planned.ends_us = inf
                 self._end(planned)
-            if planned.done:
-                continue
-            asked = planned.asked
-            time_s = flight_time_s if asked.clock == "flight" else now_us * 1e-6
-            if time_s + _HALF_US >= asked.start_s and time_s >= 0.0:
-                planned.done = True
+            if number in due:
+                asked = planned.asked
                 if asked.duration_s:
                     planned.ends_us = now_us + asked.duration_s * 1e6 - 0.5
                 self._failures.set(planned.unit, planned.kind, asked.instance, asked.value)
@@ -312,9 +305,6 @@ class Timeline:
                 self._failures.set(planned.unit, Kind.OK, each)
 
 
-_HALF_US = 0.5e-6
-
-
 class _Planned:
     """One entry of `[[failures]]`: as it was asked for, and how far it has come."""
 
@@ -322,8 +312,6 @@ class _Planned:
         self.asked: Failure = flight.scenario.failures[number]
         self.unit = Unit[self.asked.unit.upper()]
         self.kind = Kind[self.asked.type.upper()]
-        self.done = False
-        """In this flight; by the clock of the simulation: ever."""
         self.ends_us = inf
         where = f"{flight.name}: failures[{number}]"
         if problem := unsupported(self.unit, self.kind, sensors=has_sensors(flight.scenario)):

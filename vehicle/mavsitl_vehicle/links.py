@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from typing import TypeAlias
 
-from mavsitl.link.settings import DIRECTION, KEYS, LinkName, Overlay, initial
+from mavsitl.link.settings import DIRECTION, KEYS, PREFIXES, LinkName, Overlay, initial
 from mavsitl.scenario import LinkModel, Scenario, ScenarioError
 from mavsitl_vehicle.autopilot.parameters import TABLE, Parameters
 from mavsitl_vehicle.failures import Change, Failures, Kind, Unit
@@ -17,8 +17,7 @@ from mavsitl_vehicle.failures import Change, Failures, Kind, Unit
 Listener: TypeAlias = Callable[[LinkName, Overlay], None]
 
 NAMES: Mapping[LinkName, Mapping[str, str]] = {
-    "link": {key: f"SIM_LINK_{key}" for key in (*KEYS, DIRECTION)},
-    "gcs_link": {key: f"SIM_GLINK_{key}" for key in (*KEYS, DIRECTION)},
+    link: {key: f"{prefix}{key}" for key in (*KEYS, DIRECTION)} for link, prefix in PREFIXES.items()
 }
 """The parameter of each setting."""
 
@@ -65,21 +64,14 @@ class LinkControl:
         self._failures = failures
         self._listeners: list[Listener] = []
         self._told: dict[LinkName, Overlay] = {}
-        self._refusals: dict[LinkName, str] = {}
         if lockstep:
-            self._refusals["gcs_link"] = NO_GCS
+            parameters.lock(self._initial["gcs_link"], NO_GCS)
             if not scenario.impaired:
-                self._refusals["link"] = PERFECT
                 for name in self.overlay("link").values:
                     raise ScenarioError(f"parameters.{NAMES['link'][name]}: {PERFECT}")
-        for link, reason in self._refusals.items():
-            parameters.lock(self._initial[link], reason)
+                parameters.lock(self._initial["link"], PERFECT)
         parameters.subscribe(self._on_parameter)
         failures.subscribe(self._on_failure)
-
-    def refusal(self, link: LinkName) -> str | None:
-        """Why nothing can be changed on this link in this flight; None where it can."""
-        return self._refusals.get(link)
 
     def overlay(self, link: LinkName) -> Overlay:
         """The parameters that are not as in the scenario, and the failure's settings over them."""

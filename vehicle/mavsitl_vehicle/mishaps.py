@@ -10,6 +10,7 @@ from mavsitl.scenario import Flight, Gust, ScenarioError
 from mavsitl_vehicle import failures
 from mavsitl_vehicle.autopilot.parameters import TABLE, Parameters, checked
 from mavsitl_vehicle.failures import Change, Kind, Unit
+from mavsitl_vehicle.schedule import Schedule
 from mavsitl_vehicle.wind.field import mil_axes
 
 if TYPE_CHECKING:
@@ -28,31 +29,23 @@ class ParameterTimeline:
         self._parameters = parameters
         self._warn = warn
         self._changes = [
-            (change, {name: checked(f"{flight.name}: parameter_changes[{number}].", name, value)
-                      for name, value in change.parameters.items()})
+            {
+                name: checked(f"{flight.name}: parameter_changes[{number}].", name, value)
+                for name, value in change.parameters.items()
+            }
             for number, change in enumerate(flight.scenario.parameter_changes)
-        ]  # fmt: skip
-        self._done: set[int] = set()
-        self._last_flight_s = -1.0
+        ]
+        self._schedule = Schedule((change.at_s, change.clock) for change in flight.scenario.parameter_changes)
 
     def __bool__(self) -> bool:
         return bool(self._changes)
 
     def step(self, now_us: int, flight_time_s: float) -> None:
         """What is due by `now_us` since the start; the flight's time is negative before the release."""
-        if flight_time_s < 0.0 <= self._last_flight_s:
-            self._done = {number for number in self._done if self._changes[number][0].clock == "simulated"}
-        self._last_flight_s = flight_time_s
-        for number, (change, values) in enumerate(self._changes):
-            time_s = flight_time_s if change.clock == "flight" else now_us * 1e-6
-            if number not in self._done and time_s >= 0.0 and time_s + HALF_US >= change.at_s:
-                self._done.add(number)
-                for name, value in values.items():
-                    if refused := self._parameters.set(name, value):
-                        self._warn(refused.text)
-
-
-HALF_US = 0.5e-6
+        for number in self._schedule.due(now_us, flight_time_s):
+            for name, value in self._changes[number].items():
+                if refused := self._parameters.set(name, value):
+                    self._warn(refused.text)
 
 
 class Mishaps:

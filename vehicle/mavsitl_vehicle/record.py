@@ -19,7 +19,7 @@ from mavsitl_vehicle.autopilot import modes
 from mavsitl_vehicle.autopilot.health import Health
 from mavsitl_vehicle.autopilot.modes import Mode
 from mavsitl_vehicle.autopilot.telemetry import atmosphere, estimator_flags
-from mavsitl_vehicle.failures import Change
+from mavsitl_vehicle.failures import Change, has_sensors
 from mavsitl_vehicle.sensors import ekf, imu
 from mavsitl_vehicle.sensors.estimator import SensedEstimator
 from mavsitl_vehicle.sensors.status import EstimatorStatus
@@ -61,8 +61,7 @@ class Record:
                 (topics.RATES_SETPOINT, lambda v: np.column_stack((ned(v[:, 33:36]), _thrust_frd(v[:, _THRUST])))),
             ),
         )
-        sensed = flight.scenario.estimator.kind == "ekf"
-        self._sensors = SensorRecord(recorder, flight) if sensed else None
+        self._sensors = SensorRecord(recorder, flight) if has_sensors(flight.scenario) else None
         self._weights = recorder.topic(topics.PIDNN_WEIGHTS) if aboard else None
         self._status = recorder.topic(topics.VEHICLE_STATUS)
         self._land = recorder.topic(topics.LAND_DETECTED)

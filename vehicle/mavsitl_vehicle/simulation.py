@@ -14,7 +14,7 @@ from mavsitl.scenario import DrydenMil, Flight, Gust, Steady, Wind
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot.parameters import Parameters
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint
-from mavsitl_vehicle.failures import Failures
+from mavsitl_vehicle.failures import Failures, has_sensors
 from mavsitl_vehicle.motors import MotorFailures
 from mavsitl_vehicle.plant.parameters import plant_parameters
 from mavsitl_vehicle.plant.state import initial_state
@@ -82,7 +82,7 @@ class Simulation:
         self._wind_block = np.zeros((0, 0, n))
         self.sensed: SensedEstimator | None = None
         self._white = known(scenario.noise)
-        if scenario.estimator.kind == "ekf":
+        if has_sensors(scenario):
             self.sensed = self._make_sensed(seed, failures or Failures())
             self.sensed.present(self.estimate)
         self._draw()

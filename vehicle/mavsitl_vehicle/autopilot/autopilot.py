@@ -63,7 +63,6 @@ HOUSEKEEPING_US = 100_000
 SLOW_BATTERY_US = 20_000_000
 """Between two measurements of a battery that is slow."""
 
-
 _ALL_VALID = Validity()
 
 
@@ -149,8 +148,7 @@ class Autopilot:
             parameters, self._gravity, period_s, MissionCourse(shared.plan, parameters, self), self._say
         )
         self.pilot = Pilot(parameters, self._gravity, self._hover_thrust, period_s)
-        knows_height = scenario.estimator.kind == "white-noise"
-        self.land = LandDetector(self._hover_thrust, period_s, clamped=start.clamp, knows_height=knows_height)
+        self.land = LandDetector(self._hover_thrust, period_s, clamped=start.clamp, knows_height=not self.has_sensors)
         self._armed_at_us = 0
         self._flown: Mode | None = None
         """The mode flown in the last period; None: disarmed."""
