@@ -212,21 +212,13 @@ def _progress(mode: Mode, command: int, asker: Peer, seconds: float) -> None:
         mode.line.send(_ack(command, IN_PROGRESS, asker, min(int(100 * n * PROGRESS_S / seconds), 99)), n * PROGRESS_S)
 
 
-class ProgressThenResult(CommandMode):
+class ProgressThenResult(AckLate):
     """IN_PROGRESS for `seconds`, then the vehicle's own answer."""
 
-    gives = ACKS
-
-    def __init__(self, seconds: float, command: int | None) -> None:
-        super().__init__(command)
-        self._seconds = seconds
-
     def outgoing(self, message: Message) -> Sequence[Message]:
-        if not self.meant(message):
-            return (message,)
-        _progress(self, message.command, _asker(message), self._seconds)
-        self.line.send(message, self._seconds)
-        return NOTHING
+        if self.meant(message):
+            _progress(self, message.command, _asker(message), self._seconds)
+        return super().outgoing(message)
 
 
 class ProgressThenFailed(CommandMode):
