@@ -13,6 +13,7 @@ import mavsitl_vehicle
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mavsitl_vehicle import links
 from mavsitl_vehicle.autopilot.parameters import INT32_MAX, INT32_MIN, TABLE, Layer, Parameters
 
 from mavsitl.dialect import mavlink
@@ -52,8 +53,10 @@ def test_what_clients_need_is_there() -> None:
 
 
 def named_in_the_vehicle() -> set[str]:
-    """Rows whose name stands in the vehicle's source, whole or as an f-string such as ``f"MC_{axis}RATE_P"``."""
-    found = set()
+    """Rows whose name stands in the vehicle's source, whole or as an f-string such as ``f"MC_{axis}RATE_P"``, and those
+    of the links, which are composed of the names of links and settings.
+    """
+    found = {name for names in links.NAMES.values() for name in names.values()}
     for path in Path(mavsitl_vehicle.__file__).parent.rglob("*.py"):
         if path.name == "parameters.py":
             continue
