@@ -154,8 +154,10 @@ class Node:
             frames = self.signing.outgoing(frames, (self.system_id, self.component_id))
         if self.tamper is not None:
             frames = self.tamper.wire(frames)
-        if not combine:
+        if not combine or len(frames) < 2:
             return frames
+        if sum(map(len, frames)) <= max_bytes:
+            return [b"".join(frames)]
         datagrams: list[bytes] = []
         first = 0
         length = 0
