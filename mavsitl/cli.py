@@ -424,7 +424,9 @@ def _add_vehicle(commands: Any) -> None:
         "--offboard-port", type=_PORT, metavar="N", help="local port of the off-board link (default: 14580 + I)"
     )
     group.add_argument(
-        "--offboard-remote", metavar="HOST:PORT", help="where it sends first (default: 127.0.0.1:14540 + I)"
+        "--offboard-remote",
+        metavar="HOST:PORT",
+        help="where it sends first (default: 127.0.0.1:14540 + I, at most 14549)",
     )
     group.add_argument(
         "--gcs-port", type=_PORT, metavar="N", help="local port of the ground-station link (default: 18570 + I)"
@@ -462,7 +464,8 @@ def _add_ground(commands: Any) -> None:
     group.add_argument(
         "--link",
         metavar="ENDPOINT",
-        help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or tcpin:HOST:PORT (default: udpin:127.0.0.1:14540 + I)",
+        help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or tcpin:HOST:PORT "
+        "(default: udpin:127.0.0.1:14540 + I; from I = 10 on udpout:127.0.0.1:14580 + I)",
     )
     group.add_argument(
         "--system",
@@ -1005,13 +1008,22 @@ def _fleet(options: argparse.Namespace, flight: Flight, first: VehicleLinks, sys
     if options.tcp_port is not None and not options.one_link:
         raise UsageError("--tcp-port: with --count only with --one-link")
     host, port = first.offboard_remote
+
+    def remote(j: int) -> int:
+        return port + j if options.offboard_remote else ends.offboard_remote_port(options.instance + j)
+
     links = [
         dataclasses.replace(
-            first, offboard_port=first.offboard_port + j, offboard_remote=(host, port + j), gcs_port=first.gcs_port + j
+            first, offboard_port=first.offboard_port + j, offboard_remote=(host, remote(j)), gcs_port=first.gcs_port + j
         )
         for j in range(1 if options.one_link else count)
     ]
-    for name, used in (("--offboard-port", links[-1].offboard_port), ("--gcs-port", links[-1].gcs_port)):
+    last = links[-1]
+    for name, used in (
+        ("--offboard-port", last.offboard_port),
+        ("--offboard-remote", last.offboard_remote[1]),
+        ("--gcs-port", last.gcs_port),
+    ):
         if used > 65535:
             raise UsageError(f"{name}: {count} vehicles would need ports up to {used}; allowed: up to 65535")
     status = _Status(options.status == "json")
@@ -1053,7 +1065,7 @@ def _vehicle(options: argparse.Namespace) -> int:
     flight = _with_chaos(_load(options.scenario, _settings(options)), options.chaos or ())
     instance = options.instance
     system_id = options.system if options.system is not None else instance + 1
-    offboard_remote = options.offboard_remote or f"127.0.0.1:{ends.OFFBOARD_REMOTE_PORT + instance}"
+    offboard_remote = options.offboard_remote or f"127.0.0.1:{ends.offboard_remote_port(instance)}"
     links = ends.VehicleLinks(
         bind=options.bind,
         offboard_port=options.offboard_port if options.offboard_port is not None else ends.OFFBOARD_PORT + instance,
@@ -1111,7 +1123,7 @@ def _ground(options: argparse.Namespace) -> int:
     from mavsitl.link.address import parse_address
 
     flight = _load(options.scenario, _settings(options))
-    address = parse_address(options.link or f"udpin:127.0.0.1:{ends.OFFBOARD_REMOTE_PORT + options.instance}")
+    address = parse_address(options.link) if options.link else ends.ground_address(options.instance)
     _check_effect(options, "ground", ("--seed",))
     _check_lockstep(options, real_time_only=(), lockstep_only=("--deadline", "--cpu", "--vehicle"))
     first_id = options.system if options.system is not None else options.instance + 1
@@ -1146,11 +1158,15 @@ def _ground_fleet(options: argparse.Namespace, flight: Flight, first: Address, s
     links = 1 if options.one_link else count
     if first.port + links - 1 > 65535:
         raise UsageError(f"--link {first}: {count} vehicles would need ports up to {first.port + links - 1}")
-    addresses = [Address(first.kind, first.host, first.port + j) for j in range(links)]
+    addresses = [
+        Address(first.kind, first.host, first.port + j) if options.link else ends.ground_address(options.instance + j)
+        for j in range(links)
+    ]
     status = _Status(options.status == "json")
+    where = first if links == 1 else f"{first} to {addresses[-1]}"
     status.say(
-        f"ground ({flight.name}): waiting for vehicles {system_id} to {system_id + count - 1} on {first}"
-        f"{'' if links == 1 else f' to {addresses[-1].port}'}; Ctrl-C ends it"
+        f"ground ({flight.name}): waiting for vehicles {system_id} to {system_id + count - 1} on {where}; "
+        "Ctrl-C ends it"
     )
     outcome = ends.ground_fleet(
         flight, addresses, options.run_dir, count=count, first_system_id=system_id, wing=options.wing,

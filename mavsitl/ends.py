@@ -40,6 +40,20 @@ WIRE_LOG = "link.tlog"
 GCS_PORT, GCS_REMOTE_PORT = 18570, 14550
 OFFBOARD_PORT, OFFBOARD_REMOTE_PORT = 14580, 14540
 """PX4 SITL's: each is raised by the instance."""
+REMOTE_INSTANCES = 10
+"""From this instance on all send to the off-board port of the one before it, as PX4's do: higher ones are others'."""
+
+
+def offboard_remote_port(instance: int) -> int:
+    """Where an instance's off-board link sends first."""
+    return OFFBOARD_REMOTE_PORT + min(instance, REMOTE_INSTANCES - 1)
+
+
+def ground_address(instance: int) -> Address:
+    """Where a program meets an instance that nobody told otherwise: it is sent to, or has to speak first."""
+    if instance < REMOTE_INSTANCES:
+        return Address("udpin", LOOPBACK, OFFBOARD_REMOTE_PORT + instance)
+    return Address("udpout", LOOPBACK, OFFBOARD_PORT + instance)
 
 
 @dataclass(frozen=True)
