@@ -3,7 +3,8 @@
 A fleet in one process on one core; this process, on another where there is one, is what such a fleet has around it: it
 reads what all of them send on both links, says HEARTBEAT as a ground station, and streams off-board setpoints to each
 at 50 Hz, by which they take off and hover. The figure and the table are of the vehicles' process, by the system's
-account, while all fly.
+account, while all fly: processor time for each second that was simulated, so that a machine with other work on it, on
+which real time is not kept, says much the same.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import random
 import selectors
 import signal
 import socket
@@ -33,6 +35,8 @@ SETPOINT_HZ = 50.0
 HEIGHT_M = 2.0
 SETTLE_S = 5.0
 """Between the last arming and the measurement."""
+CLOCK_S = 0.3
+"""The vehicle's clock is read so often that so long is enough."""
 PATIENCE_S = 120.0
 OFFBOARD_MODE = 6
 ARMED: int = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
@@ -48,12 +52,12 @@ class Row(NamedTuple):
 
     vehicles: int
     share: float
-    """Of a core, 0 to 1."""
+    """Of a core, that real time takes: above 1 it cannot be kept."""
+    speed: float
+    """Simulated over wall time."""
     p50_us: float
     """Lateness of the ticks, from the process' start to its end."""
     p99_us: float
-    lost_s: float
-    """Real time that was given up."""
     memory_mb: float
     start_s: float
     """Until all were heard."""
@@ -65,9 +69,10 @@ class Row(NamedTuple):
         return self.share / self.vehicles
 
 
-def _free_block(count: int) -> int:
+def free_block(count: int) -> int:
     """The first of so many UDP ports in a row that were free a moment ago."""
-    for first in range(20_000, 60_000 - count, 500):
+    for _ in range(100):
+        first = random.randrange(20_000, 60_000 - count)
         sockets = []
         try:
             for port in range(first, first + count):
@@ -108,6 +113,8 @@ class Load:
         self.starts: dict[int, tuple[float, float, float]] = {}
         """Where each was at first, NED."""
         self.messages = 0
+        self.boot_ms = 0
+        """Vehicle 1's clock, as last looked at."""
 
     def send(self, j: int, message: Any) -> None:
         self._sockets[j].sendto(encode(message, self._sequence & 0xFF, *CLIENT), self._to[j])
@@ -151,6 +158,8 @@ class Load:
                     self.armed.add(frame.system_id)
             elif message.get_type() == "LOCAL_POSITION_NED":
                 self.starts.setdefault(frame.system_id, (message.x, message.y, message.z))
+                if frame.system_id == 1:
+                    self.boot_ms = message.time_boot_ms
 
     def _stream(self, now_s: float) -> None:
         for system_id, (x, y, z) in self.starts.items():
@@ -193,7 +202,7 @@ def _memory_mb(process_id: int) -> float:
 
 def measure(count: int, seconds: float, settings: Sequence[str] = ()) -> Row:
     """A fleet of `count`, flying. Raises `RuntimeError` where one is not heard or does not arm."""
-    block = _free_block(3 * count + 1)
+    block = free_block(3 * count + 1)
     ports = (block, block + count, block + 2 * count, block + 3 * count)
     offboard, remote, gcs, gcs_remote = ports
     cpus = sorted(os.sched_getaffinity(0))
@@ -223,18 +232,23 @@ def measure(count: int, seconds: float, settings: Sequence[str] = ()) -> Row:
                 load.command(system_id - 1, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
             load.run(1.5, lambda: load.armed >= wanted, look=True)
         load.run(SETTLE_S)
+        load.run(CLOCK_S, look=True)
         load.messages = 0
-        before_s, wall_s = _cpu_s(process.pid), monotonic()
+        boot_ms, before_s, wall_s = load.boot_ms, _cpu_s(process.pid), monotonic()
         load.run(seconds)
-        wall_s = monotonic() - wall_s
-        used_s = _cpu_s(process.pid) - before_s
-        sent_hz, memory_mb = load.messages / wall_s, _memory_mb(process.pid)
+        messages = load.messages
+        load.run(CLOCK_S, look=True)
+        simulated_s, wall_s = (load.boot_ms - boot_ms) / 1e3, monotonic() - wall_s
+        used_s, memory_mb = _cpu_s(process.pid) - before_s, _memory_mb(process.pid)
         process.send_signal(signal.SIGTERM)
         assert process.stdout is not None
         end = json.loads(process.stdout.read().splitlines()[-1])
         process.wait()
         p50_us, p99_us = end["lateness_us"]
-        return Row(count, used_s / wall_s, p50_us, p99_us, end["lost_s"], memory_mb, start_s, sent_hz)
+        return Row(
+            count, used_s / simulated_s, simulated_s / wall_s, p50_us, p99_us, memory_mb, start_s,
+            messages / seconds,
+        )  # fmt: skip
     finally:
         if process.poll() is None:
             process.kill()
@@ -247,13 +261,13 @@ def measure(count: int, seconds: float, settings: Sequence[str] = ()) -> Row:
 
 def table(rows: Sequence[Row]) -> list[str]:
     made = [
-        "| vehicles | of a core | each | lateness p50 | p99 | given up | messages/s out | memory | all heard |",
+        "| vehicles | of a core | each | times real time | lateness p50 | p99 | messages/s out | memory | all heard |",
         "|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for row in rows:
         made.append(
-            f"| {row.vehicles} | {100 * row.share:.1f} % | {100 * row.share_each:.2f} % | {row.p50_us / 1e3:.2f} ms "
-            f"| {row.p99_us / 1e3:.2f} ms | {row.lost_s:.1f} s | {row.sent_hz:.0f} | {row.memory_mb:.0f} MB "
+            f"| {row.vehicles} | {100 * row.share:.1f} % | {100 * row.share_each:.2f} % | {row.speed:.3f} "
+            f"| {row.p50_us / 1e3:.2f} ms | {row.p99_us / 1e3:.2f} ms | {row.sent_hz:.0f} | {row.memory_mb:.0f} MB "
             f"| {row.start_s:.1f} s |"
         )
     return made
