@@ -578,7 +578,8 @@ def fleet_realtime(
         taps = {} if folder is None else {j * per_group: logs[j][1] for j in range(len(opened))}
         started_us = monotonic_us()
         timing = fleet.run_realtime_fleet(
-            core, ports, taps, polled=lambda: ports.polled(lives), speed=speed, until_finished=until_finished,
+            core, ports, taps, logs=[] if folder is None else [tap for _, tap in logs],
+            polled=lambda: ports.polled(lives), speed=speed, until_finished=until_finished,
             stop=stop, say=report, progress=progress,
         )  # fmt: skip
         flown = tuple(

@@ -113,6 +113,7 @@ def run_realtime_fleet(
     links: Sequence[Link],
     taps: Mapping[int, Tap],
     *,
+    logs: Sequence[Tap] = (),
     polled: Callable[[], Iterable[int]] = lambda: (),
     speed: float = 1.0,
     until_finished: bool = False,
@@ -122,13 +123,13 @@ def run_realtime_fleet(
 ) -> RealTime:
     """The fleet on the wall clock, times `speed`; `links` and `taps` by port.
 
-    `polled()`: ports to be looked at whether a socket is ready or not: links that hold messages back, or whose sockets
-    come and go. However it ends, the vehicles are closed, and what they had to keep is on the disk.
+    `logs`: the taps that are told the time, whether they hear anything or not. `polled()`: ports to be looked at
+    whether a socket is ready or not: links that hold messages back, or whose sockets come and go. However it ends, the
+    vehicles are closed, and what they had to keep is on the disk.
     """
     clock = PacedClock(fleet.period_us, speed)
     intake = _Intake(fleet, links, taps)
     keeper = Keeper(fleet)
-    logs = list(taps.values())
     told_us = 0
     said_us = progressed_us = -SAY_LOST_US
     now_us = tick = 0
