@@ -199,11 +199,8 @@ class Node:
 
         A message without target fields is meant for everybody.
         """
-        message = frame.message
-        target_system = getattr(message, "target_system", 0)
-        if target_system not in (0, self.system_id):
-            return False
-        return getattr(message, "target_component", 0) in (0, self.component_id)
+        target_system, target_component = frame.target
+        return target_system in (0, self.system_id) and target_component in (0, self.component_id)
 
     def _note(self, frame: Frame) -> None:
         key = (frame.system_id, frame.component_id)

@@ -30,10 +30,10 @@ def parser(data: bytes) -> None:
     """`codec.parse`: whatever it finds is in the datagram, frame by frame, and every byte is accounted for."""
     counters = Counters()
     frames = parse(data, counters)
-    taken = b"".join(bytes(frame.message.get_msgbuf()) for frame in frames)
+    taken = b"".join(frame.raw for frame in frames)
     begin = 0
     for frame in frames:
-        begin = data.index(bytes(frame.message.get_msgbuf()), begin) + len(frame.message.get_msgbuf())
+        begin = data.index(frame.raw, begin) + len(frame.raw)
     assert len(taken) + counters.skipped_bytes == len(data)
     assert counters.frames == len(frames)
 
