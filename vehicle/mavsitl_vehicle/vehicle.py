@@ -167,7 +167,7 @@ class Vehicle:
             self._flight, self._system_id, self._port_names, self.parameters, _Body(simulation, j), kept.shared,
             lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures,
         )  # fmt: skip
-        autopilot.estimate = simulation.estimate[:, j].tolist()
+        autopilot.estimate = simulation.estimates[j]
         autopilot.estimator_status = simulation.estimator_status
         if not self._lockstep:
             autopilot.set_home_here()  # MAVSDK asks for it as soon as it hears the vehicle
@@ -289,7 +289,7 @@ class Vehicle:
         autopilot, simulation, j = self.autopilot, self.simulation, self.column
         now_us -= self._boot_us
         if self._running:
-            autopilot.estimate = simulation.estimate[:, j].tolist()
+            autopilot.estimate = simulation.estimates[j]
             autopilot.estimator_status = simulation.estimator_status
             if self._wind is not None:
                 estimate = np.ascontiguousarray(simulation.estimate[:, j : j + 1])
