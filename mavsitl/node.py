@@ -154,7 +154,7 @@ class Node:
             frames = self.signing.outgoing(frames, (self.system_id, self.component_id))
         if self.tamper is not None:
             frames = self.tamper.wire(frames)
-        if not combine:
+        if not combine or len(frames) == 1:
             return frames
         datagrams: list[bytes] = []
         first = 0

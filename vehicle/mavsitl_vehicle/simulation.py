@@ -50,7 +50,6 @@ class Simulation:
         sensed: sensors and filter; None: the estimate is the truth with white noise.
         held: (n,) in the clamp.
         estimates: the columns of `estimate` as lists.
-        log: (BLOCK_TICKS, tick.LOG_WIDTH, n), a row for what is now and for each tick before it; see `log_row`.
         at_rest: (n,) the vehicle knows that it does not move: on the ground, or in the clamp.
     """
 
@@ -99,11 +98,13 @@ class Simulation:
         self.gains = rows[tick.GAINS_AT : tick.SIGMA_AT]
         self.sigma = rows[tick.SIGMA_AT : tick.PLANT_AT]
         self.plant = rows[tick.PLANT_AT :]
+        self.estimates: list[list[float]] = self.estimate.T.tolist()
         self._asked = np.zeros((n, tick.DEMAND_ROWS))
-        self._asked_bytes = memoryview(self._asked).cast("B")
+        self._asked_bytes = self._asked.data.cast("B")
         self.demand = self._asked.T
         self.demand[tick.ATTITUDE] = 1.0
-        self.log = np.zeros((BLOCK_TICKS, tick.LOG_WIDTH, n))
+        self._log = np.zeros((BLOCK_TICKS, tick.LOG_WIDTH, n))
+        """The row of what is now is number `_tick`, modulo its length."""
         self.held = np.full(n, scenario.start.clamp)
         self.at_rest = np.ones(n, dtype=np.bool_)
         for j in range(n):
@@ -163,9 +164,7 @@ class Simulation:
         else:
             kind, attitude, rate, torque = tick.TORQUE_KIND, _LEVEL, _NOTHING, setpoint.torque
             yaw_rate = nan
-        _PACK_DEMAND(
-            self._asked_bytes, j * _DEMAND_BYTES, kind, *attitude, *rate, *torque, setpoint.thrust, yaw_rate
-        )
+        _PACK_DEMAND(self._asked_bytes, j * _DEMAND_BYTES, kind, *attitude, *rate, *torque, setpoint.thrust, yaw_rate)
 
     @property
     def estimator_status(self) -> EstimatorStatus:
@@ -303,14 +302,13 @@ class Simulation:
             return
         tick.advance(
             self._rows, self._asked, self.held, field.state, field.coefficients, self._wind_normals.block,
-            self._sensor_normals.block, self.log, number, self.dt_s, self.substeps,
+            self._sensor_normals.block, self._log, number, self.dt_s, self.substeps,
         )  # fmt: skip
         self.estimates = self.estimate.T.tolist()
 
-    @property
-    def log_row(self) -> int:
-        """Of `log`: what is now. The row before it is of the tick before, and before row 0 comes the last."""
-        return self._tick % BLOCK_TICKS
+    def logged(self, j: int, count: int) -> tick.Array:
+        """(count, tick.LOG_WIDTH) of vehicle `j`: now, and the ticks before it, the oldest first."""
+        return self._log[np.arange(self._tick - count + 1, self._tick + 1) % BLOCK_TICKS, :, j]
 
     def _advance_sensed(self, sensed: SensedEstimator, number: int) -> None:
         field, unit = self.field, sensed.imu
@@ -324,8 +322,8 @@ class Simulation:
 
     def _present(self) -> None:
         """The estimate as lists, and the log's row of what is now."""
-        self.estimates: list[list[float]] = self.estimate.T.tolist()
-        tick.write_log(self._rows, self._asked, self.log[self.log_row])
+        self.estimates = self.estimate.T.tolist()
+        tick.write_log(self._rows, self._asked, self._log[self._tick % BLOCK_TICKS])
 
     def _make_sensed(self, seed: int, failures: Failures, vehicles: Sequence[int]) -> SensedEstimator:
         return SensedEstimator(self._flight, self._parameters[0], failures, seed, self.x, self.dt_s, vehicles)
@@ -364,7 +362,7 @@ class Simulation:
             asked[:, tick.KIND] = kind
             tick.advance(
                 rows, asked, self.held, self.field.state.copy(), self.field.coefficients, self._wind_normals.block,
-                self._sensor_normals.block, self.log.copy(), 0, self.dt_s, self.substeps,
+                self._sensor_normals.block, self._log.copy(), 0, self.dt_s, self.substeps,
             )  # fmt: skip
 
     def _warm_up_sensed(self, rows: tick.Array, asked: tick.Array) -> None:
@@ -388,6 +386,7 @@ class Simulation:
         normals = self._sensor_generators[j].standard_normal(tick.MEASURE_NORMALS)[:, None]
         tick.measure(self.x[:, j : j + 1].copy(), self.sigma[:, j : j + 1].copy(), normals, estimate)
         self.estimate[:, j] = estimate[:, 0]
+        self.estimates = self.estimate.T.tolist()
 
 
 class _Normals:

@@ -105,16 +105,17 @@ class Vehicle:
         self.kept, self.failures, self.simulation, self.column = seat
         self.parameters, self.plan = self.kept.parameters, self.kept.plan
         self._signing = self.kept.signing
-        self._timeline = Timeline(flight, self.failures, lockstep=lockstep)
+        failures = Timeline(flight, self.failures, lockstep=lockstep)
         self.kept.say = lambda severity, text: self.autopilot.say(severity, text)
         self.autopilot = self._boot(0)
         self.links = LinkControl(self.parameters, self.failures, flight.scenario, lockstep=lockstep)
         self.parameters.subscribe(self._on_parameter)
         self._mishaps = Mishaps(self)
-        self._changes = ParameterTimeline(flight, self.parameters, self.warn)
+        changes = ParameterTimeline(flight, self.parameters, self.warn)
+        self._timelines: list[Timeline | ParameterTimeline] = [line for line in (failures, changes) if line]
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
-        self._record = Record(recorder, flight, aboard=self._seated is not None)
+        self._record = Record(recorder, flight, self.simulation, self.column, aboard=self._seated is not None)
         self._now_us = -self.period_us
         self._running = True
         """The autopilot does, in this control period."""
@@ -262,10 +263,8 @@ class Vehicle:
         Returns the flight's time at their beginning, negative before the release.
         """
         first = self._now_us < 0
-        if self._timeline:
-            self._timeline.step(self._now_us, self.flight_time_s)
-        if self._changes:
-            self._changes.step(self._now_us, self.flight_time_s)
+        for timeline in self._timelines:
+            timeline.step(self._now_us, self.flight_time_s)
         self._now_us = now_us
         if self._chaos is not None:
             self._chaos.step(now_us, self.flight_time_s)
@@ -280,7 +279,9 @@ class Vehicle:
             simulation.held[j] = autopilot.land.held
             simulation.at_rest[j] = autopilot.at_rest
             setpoint = autopilot.decide(now_us - self.period_us)
-            simulation.set_demand(j, self._inner_law(setpoint))
+            if self._seated is not None:
+                setpoint = self._inner_law(self._seated, setpoint)
+            simulation.set_demand(j, setpoint)
         released_us = autopilot.land.released_us
         return -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
 
@@ -358,14 +359,9 @@ class Vehicle:
         """What goes out on a link: one message a datagram, or all of a tick in one (`combine`)."""
         return self.autopilot.ports[port].node.datagrams(combine=combine)
 
-    def _inner_law(self, setpoint: Setpoint | None) -> Setpoint | None:
+    def _inner_law(self, law: SeatedLaw, setpoint: Setpoint | None) -> Setpoint | None:
         """With the PIDNN aboard, an off-board attitude becomes a torque by it; all else passes."""
-        law = self._seated
-        if (
-            law is None
-            or not isinstance(setpoint, AttitudeSetpoint)
-            or self.autopilot.commander.mode is not Mode.OFFBOARD
-        ):
+        if not isinstance(setpoint, AttitudeSetpoint) or self.autopilot.commander.mode is not Mode.OFFBOARD:
             return setpoint
         if self.autopilot.land.released_us is None:
             law.reset()
