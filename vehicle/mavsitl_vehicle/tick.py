@@ -306,7 +306,7 @@ def advance_sensed(
     dt_s: float,
     substeps: int,
 ) -> None:
-    """As `advance`, with the rate loop on the IMU's samples. The estimate, the filter's, is read alone; no log is filled.
+    """As `advance`, with the rate loop on the IMU's samples. The filter's estimate is read alone; no log is filled.
 
     Of `imu_normals` (m, substeps * 6 + 6, n) row tick % m is consumed in order; what the IMU integrated is in
     `imu_state`.

@@ -117,10 +117,15 @@ class Vehicle:
         self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
         self._record = Record(recorder, flight, self.simulation, self.column, aboard=self._seated is not None)
         self._now_us = -self.period_us
+        self._held: bool | None = None
+        self._at_rest: bool | None = None
+        """What the simulation was told last; None: nothing."""
         self._running = True
         """The autopilot does, in this control period."""
         self._boot_us = 0
         """The driver's time at which the autopilot booted last."""
+        self._clock_us = 0
+        """The autopilot's clock at the last step."""
         self._done = False
         self._recorder = recorder
         self._seed = seed
@@ -238,8 +243,9 @@ class Vehicle:
         """
         if self._mishaps.stalled:
             return 0
-        now_us = max(self._now_us - self._boot_us, 0)
-        return self.autopilot.receive(port, datagram, now_us, None if at_us is None else at_us - self._boot_us)
+        if at_us is not None:
+            at_us -= self._boot_us
+        return self.autopilot.receive(port, datagram, self._clock_us, at_us)
 
     def refuse(self, port: int, excess: Excess) -> None:
         """A datagram from a link was dropped unread, for its source had used up its budget; only counted."""
@@ -273,25 +279,29 @@ class Vehicle:
             self._reboot(now_us)
         autopilot, simulation, j = self.autopilot, self.simulation, self.column
         now_us -= self._boot_us
+        self._clock_us = now_us
         if first or not now_us:
             return -1.0
+        land = autopilot.land
         if running:
-            simulation.held[j] = autopilot.land.held
-            simulation.at_rest[j] = autopilot.at_rest
+            held, at_rest = land.held, autopilot.at_rest
+            if held is not self._held or at_rest is not self._at_rest:
+                simulation.held[j], simulation.at_rest[j] = self._held, self._at_rest = held, at_rest
             setpoint = autopilot.decide(now_us - self.period_us)
             if self._seated is not None:
                 setpoint = self._inner_law(self._seated, setpoint)
             simulation.set_demand(j, setpoint)
-        released_us = autopilot.land.released_us
+        released_us = land.released_us
         return -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
 
     def observe(self, now_us: int) -> None:
         """After the physics up to `now_us`: what the vehicle makes of it, says and logs."""
         autopilot, simulation, j = self.autopilot, self.simulation, self.column
-        now_us -= self._boot_us
         if self._running:
+            now_us = self._clock_us
             autopilot.estimate = simulation.estimates[j]
-            autopilot.estimator_status = simulation.estimator_status
+            if simulation.sensed is not None:
+                autopilot.estimator_status = simulation.sensed.status
             if self._wind is not None:
                 estimate = np.ascontiguousarray(simulation.estimate[:, j : j + 1])
                 self._wind.update(estimate, simulation.demand[tick.THRUST, j], not autopilot.on_ground)

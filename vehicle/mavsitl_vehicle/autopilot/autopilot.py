@@ -126,7 +126,8 @@ class Autopilot:
         self.parameters = parameters
         self.body = body
         self.plan = shared.plan
-        self.commander = Commander(parameters, self.say)
+        values = self._values = parameters.values
+        self.commander = Commander(values, self.say)
         self.estimate: list[float] = [0.0] * 6 + [1.0] + [0.0] * 6
         """Position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s: what telemetry says."""
         self._status = known(scenario.noise)
@@ -137,7 +138,7 @@ class Autopilot:
         self.origin = Origin(start.latitude_deg, start.longitude_deg, start.altitude_amsl_m)
         self.home: Home | None = None
         self._home_moved = False
-        self.battery = Battery(airframe, battery_settings(parameters))
+        self.battery = Battery(airframe, battery_settings(values))
         self.setpoint: Setpoint | PositionSetpoint | None = None
         """The newest off-board one."""
         self.setpoint_us: int | None = None
@@ -157,11 +158,9 @@ class Autopilot:
         self._hover_thrust = 1.0 / airframe.thrust_to_weight
         self._gravity = airframe.gravity_m_s2
         period_s = scenario.rates.control_period_us / 1e6
-        self._position_control = PositionControl(parameters, self._gravity, self._hover_thrust, period_s)
-        self.navigator = Navigator(
-            parameters, self._gravity, period_s, MissionCourse(shared.plan, parameters, self), self._say
-        )
-        self.pilot = Pilot(parameters, self._gravity, self._hover_thrust, period_s)
+        self._position_control = PositionControl(values, self._gravity, self._hover_thrust, period_s)
+        self.navigator = Navigator(values, self._gravity, period_s, MissionCourse(shared.plan, values, self), self._say)
+        self.pilot = Pilot(values, self._gravity, self._hover_thrust, period_s)
         self.land = LandDetector(self._hover_thrust, period_s, clamped=start.clamp, knows_height=not self.has_sensors)
         self._armed_at_us = 0
         self._flown: Mode | None = None
@@ -193,10 +192,11 @@ class Autopilot:
         """When the first of all that is looked at now and then is due."""
         self._commanded_us = 0
         self._housekept_us = -HOUSEKEEPING_US
-        self._plan_watch = PlanWatch(shared.plan, self.origin, parameters, lambda text: self.warn("mission", text))
+        self._plan_watch = PlanWatch(shared.plan, self.origin, values, lambda text: self.warn("mission", text))
         self._fence_breach: str | None = None
         self._router = Router(len(port_names), (system_id, COMPONENT_ID))
         self.ports = tuple(Port(name, index, self, shared, lockstep=lockstep) for index, name in enumerate(port_names))
+        self._several = len(self.ports) > 1
         self._handlers = {
             mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: self._on_attitude_target,
             mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: self._on_position_target_local_ned,
@@ -224,7 +224,7 @@ class Autopilot:
         node = port.node
         frames = node.receive(datagram)
         self._now_us = now_us
-        several = len(self.ports) > 1
+        several = self._several
         signed_only = node.signing is not None and node.signing.active
         for frame in frames if node.tamper is None else node.tamper.incoming(frames):
             if several and (frame.signed or not signed_only):
@@ -289,7 +289,7 @@ class Autopilot:
         message = frame.message
         if message.target not in (0, self.system_id) or self.failures.of(Unit.RC) is not Kind.OK:
             return
-        if self.parameters["COM_RC_IN_MODE"] in (0, 4):
+        if self._values["COM_RC_IN_MODE"] in (0, 4):
             return
         if self.pilot.receive(message, now_us):
             if self.pilot.kill_asked(now_us):
@@ -332,7 +332,7 @@ class Autopilot:
 
     def _validity(self, status: EstimatorStatus) -> Validity:
         """As the estimator says, within COM_VEL_FS_EVH and COM_POS_FS_EPH."""
-        p, before = self.parameters, self.valid
+        p, before = self._values, self.valid
         velocity_m_s, position_m = (
             p[name] * (KNOWN_FACTOR if known_before else 1.0)
             for name, known_before in (("COM_VEL_FS_EVH", before.velocity), ("COM_POS_FS_EPH", before.position))
@@ -582,7 +582,7 @@ class Autopilot:
         return Need.ATTITUDE if isinstance(setpoint, AttitudeSetpoint) else Need.NOTHING
 
     def _lost_altitude_m(self, elapsed_s: float) -> float:
-        if not self.parameters["FD_ALT_LOSS"]:
+        if not self._values["FD_ALT_LOSS"]:
             return 0.0
         target = self.position_setpoint or PositionSetpoint()
         height_m = self._state().position_nwu_m[2]
@@ -784,7 +784,7 @@ class Autopilot:
         self._fence_breach = self._plan_watch.breach((x, y, z))
         remaining_s = self.battery.remaining_s
         self._return_margin_s = inf
-        if self.parameters["COM_FLTT_LOW_ACT"] > 0 and remaining_s is not None and not self.on_ground:
+        if self._values["COM_FLTT_LOW_ACT"] > 0 and remaining_s is not None and not self.on_ground:
             self._return_margin_s = remaining_s - self.navigator.return_time_s(self._state())
         news = (self.battery.level, self._fence_breach, self._plan_watch.mission_failure, self._return_margin_s <= 0.0)
         if news != self._news:
@@ -813,8 +813,12 @@ class Autopilot:
     def report(self, now_us: int) -> None:
         """Telemetry that is due, texts, and at once what changed: HEARTBEAT, EXTENDED_SYS_STATE, HOME_POSITION."""
         changed = self._changed()
-        texts, self._texts = self._texts, []
-        home_moved, self._home_moved = self._home_moved and not self.lockstep, False
+        texts = self._texts
+        if texts:
+            self._texts = []
+        home_moved = self._home_moved
+        if home_moved:
+            self._home_moved, home_moved = False, not self.lockstep
         if self.failures.active or self._links_failed:
             self._fail_links()
         for port in self.ports:
