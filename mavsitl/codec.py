@@ -80,7 +80,9 @@ _CRC_TABLE = tuple(_crc(bytes((octet,)), 0) for octet in range(0x100))
 _STARTS = tuple(bytes((_MAGIC_V2, length)) for length in range(0x100))
 """The first two bytes of a frame, by the length of its payload."""
 
-_HEADER_LAYOUT = "<BBxxBBB3s"
+_HEADER_LAYOUT = "<2sxxBBB3s"
+_NOWHERE = 0x100  # an offset that no payload reaches
+_EVERYBODY = (0, 0)
 _write_crc = struct.Struct("<H").pack
 _new = object.__new__
 
@@ -132,6 +134,8 @@ class Frame:
     def target(self) -> tuple[int, int]:
         """Target system and component; 0 is everybody, as it is for a message without these fields."""
         raw, kind = self.raw, self._kind
+        if kind.target_system == _NOWHERE:
+            return _EVERYBODY
         begin = _HEADER_V2_BYTES if raw[0] == _MAGIC_V2 else _HEADER_V1_BYTES
         length = raw[1]
         return (
@@ -266,12 +270,6 @@ def _as_octets(field: str, count: int, value: Any) -> bytes:
     return data
 
 
-def _as_block(field: str, layout: struct.Struct, value: Any) -> bytes:
-    if isinstance(value, bytes):
-        raise ValueError(f"{field} needs exactly {layout.size} bytes")
-    return layout.pack(*value)
-
-
 def _build_writer(message_class: MessageClass, name: str, parameters: str, value_of: Callable[[_Field], str]) -> Packer:
     """A function of `parameters` that writes a frame; `value_of` gives the expression of a field's value.
 
@@ -285,12 +283,12 @@ def _build_writer(message_class: MessageClass, name: str, parameters: str, value
         "_crc": _crc,
         "_table": _CRC_TABLE,
         "_starts": _STARTS,
+        "_start": _STARTS[sum(field.bytes for field in fields)],
         "_id": message_class.id.to_bytes(3, "little"),
         "_len": len,
         "_bytes": bytes,
         "_as_text": _as_text,
         "_as_octets": _as_octets,
-        "_as_block": _as_block,
         "_errors": (struct.error, TypeError, ValueError, OverflowError),
         "_EncodeError": EncodeError,
     }
@@ -298,19 +296,23 @@ def _build_writer(message_class: MessageClass, name: str, parameters: str, value
     values: list[str] = []
     for field in fields:
         value, local = value_of(field), f"_{field.name}"
-        if field.text or field.long:
-            if field.text:
-                fits, convert = f"_len({local}) <= {field.size}", f"_as_text({field.name!r}, {field.size}, {local})"
-            elif field.octets:
-                fits, convert = f"_len({local}) == {field.size}", f"_as_octets({field.name!r}, {field.size}, {local})"
-            else:
-                names[f"_layout_of{local}"] = struct.Struct(f"<{field.layout}")
-                fits = f"_len({local}) == {field.bytes}"
-                convert = f"_as_block({field.name!r}, _layout_of{local}, {local})"
+        if field.text or field.octets:
+            fits = f"_len({local}) {'<=' if field.text else '=='} {field.size}"
+            convert = "_as_text" if field.text else "_as_octets"
             prepare.append(
                 f"        {local} = {value}\n"
                 f"        if {local}.__class__ is not _bytes or not {fits}:\n"
-                f"            {local} = {convert}\n"
+                f"            {local} = {convert}({field.name!r}, {field.size}, {local})\n"
+            )
+            values.append(local)
+        elif field.long:
+            names[f"_pack{local}"] = struct.Struct(f"<{field.layout}").pack
+            prepare.append(
+                f"        {local} = {value}\n"
+                f"        if {local}.__class__ is not _bytes:\n"
+                f"            {local} = _pack{local}(*{local})\n"
+                f"        elif _len({local}) != {field.bytes}:\n"
+                f"            raise ValueError('{field.name} needs exactly {field.bytes} bytes')\n"
             )
             values.append(local)
         elif field.size > 1:
@@ -324,8 +326,7 @@ def _build_writer(message_class: MessageClass, name: str, parameters: str, value
         f"def {name}({parameters}):\n"
         "    try:\n"
         f"{''.join(prepare)}"
-        f"        _frame = _whole({_MAGIC_V2}, {sum(field.bytes for field in fields)},\n"
-        f"            _sequence, _system_id, _component_id, _id, {', '.join(values)})\n"
+        f"        _frame = _whole(_start, _sequence, _system_id, _component_id, _id, {', '.join(values)})\n"
         "    except _errors as error:\n"
         f"        raise _EncodeError(f'{message_class.msgname}: {{error}}') from error\n"
         "    if not _frame[-1]:\n"
@@ -389,8 +390,9 @@ def encode(message: Message, sequence: int, system_id: int, component_id: int) -
         EncodeError: a field does not fit. Text longer than its field is refused, where pymavlink cuts it.
     """
     message_class = message.__class__
-    function = _encoders.get(message_class)
-    if function is None:
+    try:
+        function = _encoders[message_class]
+    except KeyError:
         function = _encoders[message_class] = _build_encoder(message_class)
     return function(message, sequence, system_id, component_id)
 
@@ -525,7 +527,7 @@ def _begin_reading(fields: list[_Field]) -> tuple[str, dict[str, Any]]:
 def _build_decoder(message_class: MessageClass) -> Callable[[bytes], Message]:
     fields = _fields(message_class)
     short, names = _begin_reading(fields)
-    names |= {"_new": _new, "_class": _received(message_class), "_list": list, "_str": str}
+    names |= {"_new": _new, "_class": _received(message_class), "_list": list}
     targets: list[str] = []
     rest: list[str] = []
     for index, field in enumerate(fields):
@@ -533,9 +535,8 @@ def _build_decoder(message_class: MessageClass) -> Callable[[bytes], Message]:
         if field.text:
             targets.append(local)
             rest.append(f"    message._{field.name}_raw = {local} = {local}.rstrip(b'\\0')\n")
-            rest.append(
-                f"    {attribute} = _str({local}, 'ascii', 'replace') if 0 not in {local} else _as_string({local})\n"
-            )
+            easy = f"{local}.isascii() and 0 not in {local}"
+            rest.append(f"    {attribute} = {local}.decode() if {easy} else _as_string({local})\n")
         elif field.octets:
             targets.append(local)
             rest.append(f"    {attribute} = _list({local})\n")
@@ -609,9 +610,6 @@ def reader(message_class: MessageClass, *fieldnames: str) -> Reader:
     return _build_reader(message_class, fieldnames)
 
 
-_NOWHERE = 0x100  # an offset that no payload reaches
-
-
 class _Kind:
     """What has to be known of a message class to check and read its frames."""
 
@@ -676,8 +674,9 @@ def parse(datagram: bytes, counters: Counters | None = None, max_bytes: int = MA
     # Nearly every datagram is one good unsigned MAVLink 2 frame. All others, and what is wrong with them, are left to
     # the search, which would find the same.
     if size > _HEADER_V2_BYTES and datagram[0] == _MAGIC_V2 and datagram[1] + _FRAME_BYTES == size and not datagram[2]:
-        kind = _kinds.get(datagram[7:10])
-        if kind is not None:
+        id_bytes = datagram[7:10]
+        if id_bytes in _kinds:
+            kind = _kinds[id_bytes]
             crc = _crc(datagram[:-_CRC_BYTES], _CRC_BEFORE_V2)
             if datagram[-2] | datagram[-1] << 8 == crc >> 8 ^ _CRC_TABLE[(crc ^ kind.extra) & 0xFF]:
                 frame = Frame()
