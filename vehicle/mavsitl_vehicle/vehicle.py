@@ -46,8 +46,13 @@ class Seat(NamedTuple):
     column: int
 
 
-def take_seats(flights: Sequence[Flight], kept: Sequence[Kept], seed: int, *, shared_wind: bool = False) -> list[Seat]:
-    """For vehicles of one scenario that differ in where they start; those with sensors have a simulation each."""
+def take_seats(
+    flights: Sequence[Flight], kept: Sequence[Kept], seed: int, *, first: int = 0, shared_wind: bool = False
+) -> list[Seat]:
+    """For vehicles of one scenario that differ in where they start; those with sensors have a simulation each.
+
+    `first`: the first one's number in the fleet, see `Simulation`.
+    """
     failures = [Failures() for _ in flights]
     parameters = [each.parameters for each in kept]
     if has_sensors(flights[0].scenario):
@@ -55,15 +60,16 @@ def take_seats(flights: Sequence[Flight], kept: Sequence[Kept], seed: int, *, sh
             Seat(
                 kept[j],
                 failures[j],
-                Simulation(flights[j], parameters[j], seed, 1, failures[j], first=j, shared_wind=shared_wind),
+                Simulation(flights[j], parameters[j], seed, 1, failures[j], first=first + j, shared_wind=shared_wind),
                 0,
             )
             for j in range(len(flights))
         ]
     positions = [flight.scenario.start.position_nwu_m for flight in flights]
     simulation = Simulation(
-        flights[0], parameters, seed, len(flights), failures, positions_nwu_m=positions, shared_wind=shared_wind
-    )
+        flights[0], parameters, seed, len(flights), failures,
+        first=first, positions_nwu_m=positions, shared_wind=shared_wind,
+    )  # fmt: skip
     return [Seat(each, broken, simulation, j) for j, (each, broken) in enumerate(zip(kept, failures, strict=True))]
 
 
@@ -83,6 +89,7 @@ class Vehicle:
         logs: Path | None = None,
         unix_us: Callable[[], int] | None = None,
         trusted: bool = True,
+        forwards: bool = True,
         seat: Seat | None = None,
     ) -> None:
         """`ports` name the links in order: "offboard", "gcs".
@@ -92,11 +99,13 @@ class Vehicle:
         a clock that does not jump, for SYSTEM_TIME and signatures; None: not known, and then there is no signing. A
         first signing key is taken only where the links are `trusted`: on loopback.
 
-        `seat`: of a fleet; what it keeps, its state, logs and clock, are then the seat's. None: a fleet of one.
+        `forwards`: frames of others are passed on from link to link. `seat`: of a fleet; what it keeps, its state,
+        logs and clock, are then the seat's. None: a fleet of one.
         """
         self.period_us = flight.scenario.rates.control_period_us
         self._flight = flight
-        self._system_id = system_id
+        self.system_id = system_id
+        self._forwards = forwards
         self._port_names = tuple(ports)
         self._lockstep = lockstep
         if seat is None:
@@ -170,8 +179,8 @@ class Vehicle:
         kept, simulation, j = self.kept, self.simulation, self.column
         unix_us = 0 if kept.unix_us is None else kept.unix_us()
         autopilot = Autopilot(
-            self._flight, self._system_id, self._port_names, self.parameters, _Body(simulation, j), kept.shared,
-            lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures,
+            self._flight, self.system_id, self._port_names, self.parameters, _Body(simulation, j), kept.shared,
+            lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures, forwards=self._forwards,
         )  # fmt: skip
         autopilot.estimate = simulation.estimates[j]
         autopilot.estimator_status = simulation.estimator_status
@@ -427,6 +436,13 @@ _STATE_MESSAGES = {
 }
 
 
-def build(flight: Flight, recorder: Recorder, **options: Any) -> Vehicle:
-    """The entry point `mavsitl.vehicle`: a vehicle core for the bridge's drivers."""
-    return Vehicle(flight, recorder, **options)
+def build(flight: Flight, recorder: Any, *, count: int | None = None, **options: Any) -> Any:
+    """The entry point `mavsitl.vehicle`: a vehicle core for the bridge's drivers; with `count` a `Fleet`.
+
+    `recorder` is one of these, for a fleet as many.
+    """
+    if count is None:
+        return Vehicle(flight, recorder, **options)
+    from mavsitl_vehicle.fleet import Fleet  # here, for it is made of vehicles
+
+    return Fleet(flight, recorder, count=count, **options)
