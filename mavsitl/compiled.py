@@ -5,7 +5,8 @@ gives un-jitted. Set ``MAVSITL_JIT=0`` to run the text itself (slow; for debugge
 together).
 
 Numba's cache does not notice a change in a function that a cached function calls. The cache therefore lives in a folder
-named by a digest of every source file of the packages that compile: a changed text never meets a stale cache.
+named by a digest of every source file of the packages and modules that compile: a changed text never meets a stale
+cache.
 """
 
 from __future__ import annotations
@@ -20,16 +21,20 @@ from typing import Any, TypeVar, cast
 F = TypeVar("F", bound=Callable[..., Any])
 
 JIT = os.environ.get("MAVSITL_JIT", "1") != "0"
-_COMPILING_PACKAGES = ("mavsitl.control", "mavsitl_vehicle", "mavsitl_ground")
+_COMPILING = ("mavsitl.control", "mavsitl.quaternion", "mavsitl_vehicle", "mavsitl_ground")
 
 
 def _source_digest() -> str:
     digest = hashlib.blake2b(digest_size=8)
-    for name in _COMPILING_PACKAGES:
+    for name in _COMPILING:
         spec = find_spec(name)
-        for folder in spec.submodule_search_locations or () if spec else ():
-            for file in sorted(Path(folder).rglob("*.py")):
-                digest.update(file.read_bytes())
+        if spec is None:
+            continue
+        files = [
+            file for folder in spec.submodule_search_locations or () for file in sorted(Path(folder).rglob("*.py"))
+        ]
+        for file in files or [Path(spec.origin or "")]:
+            digest.update(file.read_bytes())
     digest.update(Path(__file__).read_bytes())
     return digest.hexdigest()
 
@@ -50,6 +55,14 @@ def compiled(function: F) -> F:
     import numba
 
     return cast("F", numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+
+
+def inlined(function: F) -> F:
+    if not JIT:
+        return function
+    import numba
+
+    return cast("F", numba.njit(inline="always", cache=True, fastmath=False, error_model="numpy")(function))
 
 
 if JIT:

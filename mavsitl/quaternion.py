@@ -3,12 +3,12 @@
 Every function takes and gives tuples, in any pair of frames: a quaternion is ``(w, x, y, z)`` with i j = k, and turns a
 vector's body components into its world components. Angles are in radians; Euler angles are Z-Y-X (yaw, then pitch, then
 roll, each about the axis the last turn left). Functions that call their argument `unit` do not check its norm:
-`normalise` does, once, where a quaternion comes in.
+`normalise` does, once, where a quaternion comes in. `mavsitl.control.rotation` compiles some of these texts.
 """
 
 from __future__ import annotations
 
-from math import atan2, cos, hypot, isfinite, pi, remainder, sin, sqrt
+from math import atan2, copysign, cos, hypot, isfinite, pi, sin, sqrt
 
 from mavsitl.frames import Quaternion, Vector
 
@@ -97,7 +97,9 @@ def to_euler(unit: Quaternion) -> Vector:
     pitch = atan2(sin_pitch, cos_pitch)
     if cos_pitch < _GIMBAL_LOCK_COS_PITCH:
         yaw = 2.0 * atan2(x, w)
-        return 0.0, pitch, remainder(-yaw if sin_pitch > 0.0 else yaw, 2.0 * pi)
+        if abs(yaw) > pi:
+            yaw -= copysign(2.0 * pi, yaw)
+        return 0.0, pitch, -yaw if sin_pitch > 0.0 else yaw
     return atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)), pitch, atan2(forward_y, forward_x)
 
 

@@ -10,28 +10,27 @@ from math import acos, cos, degrees, exp, radians, sqrt
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mavsitl.codec import packer
+from mavsitl.codec import Frame, packer
+from mavsitl.control.arrays import Floats, Record, record
 from mavsitl.control.filters import FirstOrder
 from mavsitl.control.inner_loop import InnerLoop
 from mavsitl.control.pid import PositionLoop
-from mavsitl.control.wind_observer import WindObserver, model_acceleration
+from mavsitl.control.wind_observer import WindObserver
 from mavsitl.dialect import mavlink
-from mavsitl.frames import Quaternion, Vector, flip_euler
-from mavsitl.log import topics
-from mavsitl.log.block import Block, ned
+from mavsitl.frames import Vector, flip_quaternion, flip_vector
 from mavsitl.log.ulog import Recorder
 from mavsitl.node import Node
-from mavsitl.quaternion import from_euler
+from mavsitl.quaternion import IDENTITY, from_yaw
 from mavsitl.scenario import Flight, ScenarioError
 from mavsitl.services.statustext import Joiner
-from mavsitl_ground import demand
+from mavsitl_ground import cycle
+from mavsitl_ground.cycle import Demand
+from mavsitl_ground.demand import SENDS
 from mavsitl_ground.observer import Observer
+from mavsitl_ground.record import block
 from mavsitl_ground.reference import reference_for
-from mavsitl_ground.sequence import ENDED, Handshake, Phase
-
-Array = NDArray[np.float64]
+from mavsitl_ground.sequence import ENDED, NOW, Handshake, Phase
 
 SYSTEM_ID = 250
 COMPONENT_ID = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -64,136 +63,78 @@ class Controller:
 
         Raises `ScenarioError` where the airframe does not say what the command level needs.
         """
-        scenario, airframe = flight.scenario, flight.airframe
-        settings = scenario.controller
-        self._airframe = airframe
-        self._settings = settings
-        self._period_s = scenario.rates.control_period_us / 1e6
-        self._reference = reference_for(scenario.reference, offset_nwu_m)
-        self._outer = PositionLoop(
-            settings.altitude, settings.position, airframe.mass_kg, airframe.gravity_m_s2,
-            radians(settings.tilt_limit_deg), airframe.max_thrust_n, self._period_s,
-        )  # fmt: skip
-        self._filter = FirstOrder(settings.angle_filter_rad_s, self._period_s, rows=2)
-        self._inner = InnerLoop(settings, airframe, self._period_s)
-        self._wind_observer = WindObserver(
-            settings.wind_observer.horizontal_rad_s, settings.wind_observer.vertical_rad_s
-        )
-        self._rate_gain = _rate_gain(flight) if settings.level == "body_rate" else (1.0, 1.0, 1.0)
-        self._whole_attitude = settings.level == "attitude" and settings.inner == "stock"
-        self._yaw_rad = np.zeros(1)
-        self._lead_s = _attitude_lag_s(flight) if settings.level == "attitude" else 0.0
-        tau = airframe.rotor_time_constant_s
-        self._thrust_share = 1.0 - exp(-self._period_s / tau) if tau > 0.0 else 1.0
-        area = np.pi * airframe.rotor_radius_m**2
-        self._coupling = airframe.wind_coupling * sqrt(8.0 * airframe.air_density_kg_m3 * area) / airframe.mass_kg
-        self._wanted = np.zeros(9)
-        self._position = self._wanted[0:3, np.newaxis]
-        self._velocity = self._wanted[3:6, np.newaxis]
-        self._acceleration = self._wanted[6:9, np.newaxis]
-        self._model = np.zeros((3, 1))
-        self._desired = np.zeros((3, 1))
-        self._desired_rates = np.zeros((3, 1))
-        self._tilt = np.zeros((2, 1))
-        self._no_wind = np.zeros((3, 1))
-        self._acting_thrust = np.array([airframe.weight_n])
-        self.wind_acceleration = self._no_wind
-        """W_1..W_3 as used, m/s^2 NWU (3, 1)."""
-        self.reference = self._reference.sample(0.0)
-        """Position m, velocity m/s, acceleration m/s^2 (NWU) and yaw rad as last used."""
-        self.thrust_n = airframe.weight_n
-        self.omega_acceleration = np.zeros((3, 1))
-        """What the inner loop asked for, rad/s^2 FLU (3, 1)."""
+        settings = flight.scenario.controller
+        self.reference = reference_for(flight.scenario.reference, offset_nwu_m)
+        self._memory = _at_rest(flight)
+        self._at_rest = self._memory.copy()
+        self.learns = settings.level != "attitude" and settings.law == "pidnn"
+        """A PIDNN is here, not aboard or nowhere: rows of the log have its weights."""
+        if settings.level == "attitude":
+            self._cycle = cycle.attitude_cycle
+        else:
+            self._cycle = cycle.net_cycle if self.learns else cycle.pid_cycle
+        # Compiles, or reads the cache, before the clock runs.
+        self.update(0.0, Observer(), np.zeros(cycle.COLUMNS), 0, 0, 0, 0)
         self.reset()
-        self.update(0.0, Observer())  # compiles, or reads the cache, before the clock runs
-        self.reset()
-
-    @property
-    def desired_rad(self) -> Array:
-        """phi_d, theta_d, psi_d as handed to the inner loop (3, 1)."""
-        return self._desired
-
-    @property
-    def weights(self) -> Array | None:
-        """The PIDNN's output weights (3 outputs, 3 axes, 1); None for the PID."""
-        return self._inner.weights
 
     def reset(self) -> None:
         """At rest at the start of a flight: integrators empty, nets as the identical PID, rotors at hover."""
-        self._outer.reset()
-        self._filter.reset()
-        self._inner.reset()
-        self._wind_observer.reset()
-        self._acting_n = self._acting_thrust[0] = self._airframe.weight_n
-        self.thrust_n = self._airframe.weight_n
-        self._stamp_us = -1
-        self.wind_acceleration = self._no_wind
+        self._memory[:] = self._at_rest
 
-    def update(self, time_s: float, state: Observer) -> None:
-        """One control cycle at flight time `time_s`; fills thrust_n, desired_rad and omega_acceleration."""
-        self.reference = self._reference.sample(time_s)
-        position, velocity, acceleration, yaw = self.reference
-        self._wanted[:] = (*position, *velocity, *acceleration)
-        self.wind_acceleration = self._wind(state)
-        thrust, phi, theta = self._outer.update(
-            state.position_nwu_m, state.velocity_nwu_m_s, state.quaternion,
-            self._position, self._velocity, self._acceleration, self._yaw(state, yaw), self.wind_acceleration,
+    def update(
+        self, time_s: float, state: Observer, row: Floats, frames: int, lost: int, rejected: int, age_us: int
+    ) -> Demand:
+        """One control cycle at flight time `time_s`; fills `row`, (cycle.COLUMNS,), the last four with it."""
+        self.reference.move(time_s)
+        return self._cycle(
+            self._memory, state.state, self.reference.now, row,
+            state.stamp_us, frames, lost, rejected, age_us,
         )  # fmt: skip
-        self._tilt[0, 0], self._tilt[1, 0] = phi[0], theta[0]
-        self._filter.update(self._tilt)
-        self._desired[:2] = self._filter.value
-        self._desired_rates[:2] = self._filter.rate
-        self._desired[2, 0] = yaw
-        self.thrust_n = float(thrust[0])
-        if self._settings.level != "attitude":
-            self.omega_acceleration = self._inner.update(
-                state.angles_rad, state.angle_rates_rad_s, self._desired, self._desired_rates
-            )
 
-    def _yaw(self, state: Observer, reference_rad: float) -> Array:
-        """The yaw at which the tilt is flown: the reference's where all is sent as one attitude, else the measured."""
-        if not self._whole_attitude:
-            measured: Array = state.angles_rad[2]
-            return measured
-        self._yaw_rad[0] = reference_rad
-        return self._yaw_rad
 
-    def _wind(self, state: Observer) -> Array:
-        """W_1..W_3 of eq 11 by the scenario's source; the model includes the rotors' lag where the airframe has one."""
-        acting_n = self._acting_n + self._thrust_share * (self.thrust_n - self._acting_n)
-        self._acting_n = self._acting_thrust[0] = acting_n
-        source = self._settings.wind_information
-        if source == "oracle":
-            if state.true_wind_nwu_m_s is None:
-                return self._no_wind
-            return self._coupling * sqrt(max(acting_n, 0.0)) * state.true_wind_nwu_m_s
-        if source == "none":
-            return self._no_wind
-        airframe = self._airframe
-        model_acceleration(state.quaternion, self._acting_thrust, airframe.mass_kg, airframe.gravity_m_s2, self._model)
-        period_s = self._period_s if self._stamp_us < 0 else (state.stamp_us - self._stamp_us) / 1e6
-        self._stamp_us = state.stamp_us
-        return self._wind_observer.update(state.velocity_nwu_m_s, self._model, period_s)
-
-    def rates_flu_rad_s(self, state: Observer) -> Vector:
-        """Level `body_rate`: the rates that make a proportional rate loop give the wanted angular acceleration."""
-        p, q, r = state.omega_flu_rad_s[:, 0].tolist()
-        to_p, to_q, to_r = self.omega_acceleration[:, 0].tolist()
-        k_p, k_q, k_r = self._rate_gain
-        return p + to_p / k_p, q + to_q / k_q, r + to_r / k_r
-
-    def attitude(self) -> Quaternion:
-        """Level `attitude`: the desired angles, leading by the known lag of the loop aboard, FLU -> NWU.
-
-        The loop aboard gets no angle rates over the wire, so without the lead it would follow phi_d late.
-        """
-        phi, theta, psi = self._desired[:, 0].tolist()
-        phi_rate, theta_rate, _ = self._desired_rates[:, 0].tolist()
-        return from_euler(phi + self._lead_s * phi_rate, theta + self._lead_s * theta_rate, psi)
-
-    def torque_shares(self) -> list[float]:
-        shares: list[float] = self._inner.torque_shares(self.omega_acceleration)[:, 0].tolist()
-        return shares
+def _at_rest(flight: Flight) -> Record:
+    """What the compiled cycle keeps for itself, before the first period: settings, the laws' records, outputs."""
+    scenario, airframe = flight.scenario, flight.airframe
+    settings = scenario.controller
+    period_s = scenario.rates.control_period_us / 1e6
+    outer = PositionLoop(
+        settings.altitude, settings.position, airframe.mass_kg, airframe.gravity_m_s2,
+        radians(settings.tilt_limit_deg), airframe.max_thrust_n, period_s,
+    )  # fmt: skip
+    inner = InnerLoop(settings, airframe, period_s)
+    tau = airframe.rotor_time_constant_s
+    area = np.pi * airframe.rotor_radius_m**2
+    coupling = airframe.wind_coupling * sqrt(8.0 * airframe.air_density_kg_m3 * area) / airframe.mass_kg
+    vector = np.zeros((3, 1))
+    return record(
+        period_s=period_s,
+        level=cycle.LEVELS.index(settings.level),
+        whole_attitude=settings.level == "attitude" and settings.inner == "stock",
+        lead_s=_attitude_lag_s(flight) if settings.level == "attitude" else 0.0,
+        rate_gain=_rate_gain(flight) if settings.level == "body_rate" else (1.0, 1.0, 1.0),
+        acceleration_limit=inner.limit,
+        max_thrust_n=airframe.max_thrust_n,
+        mass_kg=airframe.mass_kg,
+        gravity_m_s2=airframe.gravity_m_s2,
+        wind_source=cycle.WIND_SOURCES.index(settings.wind_information),
+        coupling=coupling,
+        thrust_share=1.0 - exp(-period_s / tau) if tau > 0.0 else 1.0,
+        # From period to period.
+        stamp_us=-1,
+        thrust_n=airframe.weight_n,
+        acting_n=[airframe.weight_n],
+        position=outer.record(),
+        filter=FirstOrder(settings.angle_filter_rad_s, period_s, rows=2).record(),
+        observer=WindObserver(settings.wind_observer.horizontal_rad_s, settings.wind_observer.vertical_rad_s).record(),
+        law=inner.law.record(),
+        # Filled in each period.
+        wind=vector,
+        model=vector,
+        yaw=[0.0],
+        desired=vector,
+        desired_rates=vector,
+        direct=vector,
+    )
 
 
 def _attitude_lag_s(flight: Flight) -> float:
@@ -245,7 +186,7 @@ class Ground:
         scenario = flight.scenario
         self.period_us = scenario.rates.control_period_us
         self._scenario = scenario
-        self._level = scenario.controller.level
+        self._send_demand = SENDS[scenario.controller.level]
         self._node = Node(SYSTEM_ID, COMPONENT_ID)
         self._observer = Observer(scenario.controller.telemetry)
         self._controller = Controller(flight, offset_nwu_m)
@@ -271,10 +212,10 @@ class Ground:
         self._down_since_us: int | None = None
         self._has_flown = False
         self._heartbeat_us = -HEARTBEAT_INTERVAL_US
-        self._record = _Record(
-            recorder, flight, with_weights=self._level != "attitude" and self._controller.weights is not None
-        )
+        self._rows = block(recorder, flight, with_weights=self._controller.learns)
         self._now_us = 0
+        self._due_us = NOW
+        """Until then, and until something comes but the state, nothing is to be done but control."""
 
     @property
     def phase(self) -> str:
@@ -312,7 +253,8 @@ class Ground:
     @property
     def reference_nwu_m(self) -> Vector:
         """Where it was to be when it was last controlled."""
-        return self._controller.reference[0]
+        x, y, z = self._controller.reference.now["position"][0, :, 0].tolist()
+        return x, y, z
 
     @property
     def vehicle_time_us(self) -> int:
@@ -326,39 +268,35 @@ class Ground:
     def receive(self, port: int, datagram: bytes) -> int:
         """One datagram from the link; the number of valid frames in it."""
         frames = self._node.receive(datagram)
-        handshake = self._handshake
         for frame in frames:
-            message = frame.message
-            if type(message).id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-                handshake.on_heartbeat(message, frame.system_id, frame.component_id, self._now_us)
-            elif handshake.accepts(frame.system_id, frame.component_id):
+            take = self._observer.handlers.get(frame.message_id)
+            if take is None:
+                self._on_message(frame)
+            elif self._handshake.accepts(frame.system_id, frame.component_id):
                 stamp_us = self._observer.stamp_us
-                self._observer.receive(message)
-                handshake.clock_goes_on = handshake.clock_goes_on or self._observer.stamp_us > stamp_us
-                handshake.on_message(message, self._now_us)
-                if type(message).id == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
-                    sender = (frame.system_id, frame.component_id)
-                    for text in self._texts.receive(message, sender, self._now_us):
-                        self._report(f"vehicle: {text.text}")
+                take(frame)
+                self._handshake.on_state(self._observer.stamp_us > stamp_us, self._now_us)
         return len(frames)
+
+    def _on_message(self, frame: Frame) -> None:
+        """What is no state: the handshake's, and texts."""
+        self._due_us = NOW
+        handshake = self._handshake
+        if frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            handshake.on_heartbeat(frame.message, frame.system_id, frame.component_id, self._now_us)
+        elif handshake.accepts(frame.system_id, frame.component_id):
+            handshake.on_message(frame, self._now_us)
+            if frame.message_id == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
+                sender = (frame.system_id, frame.component_id)
+                for text in self._texts.receive(frame.message, sender, self._now_us):
+                    self._report(f"vehicle: {text.text}")
 
     def step(self, now_us: int) -> None:
         """At least every control period, and after each datagram: control on new state, handshake, heartbeat."""
         self._now_us = now_us
-        for text in self._texts.step(now_us):
-            self._report(f"vehicle: {text.text}")
-        handshake, state = self._handshake, self._observer
-        before = handshake.phase
-        restarted = state.restarted
-        if restarted:
-            handshake.lose("its clock went back, it has restarted", now_us)
-        handshake.step(now_us)
-        if restarted or (handshake.phase is Phase.SEARCH and before is not Phase.SEARCH):
-            self._observer.reset()
-            self._controller.reset()
-            self._released_us = None
-        if handshake.phase is Phase.FLY and self._released_us is None:
-            self._released_us = state.stamp_us
+        state = self._observer
+        if now_us >= self._due_us or state.restarted:
+            self._attend(now_us)
         if state.fresh and state.valid(now_us):
             state.take()
             if self._scenario.ground_contact:
@@ -376,33 +314,55 @@ class Ground:
                 3,
             )
 
+    def _attend(self, now_us: int) -> None:
+        """Texts, handshake, and what they mean for the flight."""
+        for text in self._texts.step(now_us):
+            self._report(f"vehicle: {text.text}")
+        handshake, state = self._handshake, self._observer
+        before = handshake.phase
+        restarted = state.restarted
+        if restarted:
+            handshake.lose("its clock went back, it has restarted", now_us)
+        handshake.step(now_us)
+        if restarted or (handshake.phase is Phase.SEARCH and before is not Phase.SEARCH):
+            self._observer.reset()
+            self._controller.reset()
+            self._released_us = None
+        if handshake.phase is Phase.FLY and self._released_us is None:
+            self._released_us = state.stamp_us
+        self._due_us = NOW if self._texts.waiting else handshake.due_us
+
     def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
         return self._node.datagrams(combine=combine)
 
     def _control(self, now_us: int) -> None:
-        handshake, state, controller = self._handshake, self._observer, self._controller
+        handshake, state = self._handshake, self._observer
         target = handshake.target
         if target is None or self.finished:
             return
-        if self._released_us is None or not (handshake.in_control or handshake.phase is Phase.STOP):
-            controller.reset()
-            thrust = self._hover_thrust if handshake.armed else 0.0
-            self._send_idle(target, thrust)
+        stamp_us, released_us = state.stamp_us, self._released_us
+        if released_us is None or not (handshake.in_control or handshake.phase is Phase.STOP):
+            self._controller.reset()
+            self._send_demand(self._node, target, stamp_us, self._idle())
             return
-        time_s = (state.stamp_us - self._released_us) / 1e6
-        controller.update(time_s, state)
-        thrust = controller.thrust_n / self._max_thrust_n
-        if self._level == "attitude":
-            demand.send_attitude(self._node, target, state.stamp_us, controller.attitude(), thrust)
-        elif self._level == "body_rate":
-            demand.send_rates(self._node, target, state.stamp_us, controller.rates_flu_rad_s(state), thrust)
-        else:
-            demand.send_torque(self._node, target, state.stamp_us, controller.torque_shares(), thrust)
-        source = self._node.sources.get(target)
-        lost = 0 if source is None else source.lost
-        self._record.write(now_us, state, controller, thrust, self._node.counters, lost)
-        if handshake.phase is Phase.FLY and time_s >= self._scenario.duration_s:
+        time_s = (stamp_us - released_us) / 1e6
+        counters, source = self._node.counters, self._node.sources.get(target)
+        demand = self._controller.update(
+            time_s, state, self._rows.row(stamp_us),
+            counters.frames, 0 if source is None else source.lost, counters.rejected, state.age_us(now_us) or 0,
+        )  # fmt: skip
+        self._send_demand(self._node, target, stamp_us, demand)
+        if time_s >= self._scenario.duration_s and handshake.phase is Phase.FLY:
             handshake.finish(now_us)
+            self._due_us = NOW
+
+    def _idle(self) -> Demand:
+        """Before the flight and while not in control: level, no rates; it keeps the stream, and lock-step, going."""
+        thrust = self._hover_thrust if self._handshake.armed else 0.0
+        if self._scenario.controller.level == "attitude":
+            yaw_rad = float(self._observer.angles_rad[2, 0])
+            return flip_quaternion(*from_yaw(yaw_rad)), 0.0, 0.0, 0.0, thrust
+        return IDENTITY, *flip_vector(0.0, 0.0, 0.0), thrust
 
     def _watch_crash(self, now_us: int) -> None:
         state, handshake = self._observer, self._handshake
@@ -415,7 +375,7 @@ class Ground:
             return
         phi, theta, _ = state.angles_rad[:, 0].tolist()
         upright = cos(phi) * cos(theta)
-        below_m = self._controller.reference[0][2] - height_m
+        below_m = float(self._controller.reference.now["position"][0, 2, 0]) - height_m
         sunk = self._has_flown and handshake.in_control and below_m > CRASHED_BELOW_M
         if not (upright < CRASHED_TILT_COS or sunk):
             self._down_since_us = None
@@ -424,77 +384,11 @@ class Ground:
         elif state.stamp_us - self._down_since_us >= CRASHED_TIME_US:
             text = f"the vehicle is on the ground, {below_m:.1f} m below its reference"
             handshake.crash(f"{text}, tilted by {degrees(acos(upright)):.0f} deg", now_us)
-
-    def _send_idle(self, target: tuple[int, int], thrust: float) -> None:
-        """Before the flight and while not in control: level, no rates; it keeps the stream, and lock-step, going."""
-        stamp_us = self._observer.stamp_us
-        if self._level == "attitude":
-            yaw_rad = float(self._observer.angles_rad[2, 0])
-            demand.send_attitude(self._node, target, stamp_us, from_euler(0.0, 0.0, yaw_rad), thrust)
-        elif self._level == "body_rate":
-            demand.send_rates(self._node, target, stamp_us, (0.0, 0.0, 0.0), thrust)
-        else:
-            demand.send_torque(self._node, target, stamp_us, (0.0, 0.0, 0.0), thrust)
+            self._due_us = NOW
 
     def _send_command(self, command: int, confirmation: int, params: tuple[float, ...]) -> None:
         system_id, component_id = self._handshake.target or (0, 0)
         self._node.send(COMMAND_LONG, system_id, component_id, command, confirmation, *params)
-
-
-# Columns of the ground's log block.
-_REFERENCE = slice(0, 7)  # position, velocity, yaw
-_DESIRED = slice(7, 10)
-_THRUST = 10
-_U1 = 11
-_ACCELERATION = slice(12, 15)
-_WIND = slice(15, 18)
-_LINK = slice(18, 22)
-_WEIGHTS = slice(22, 31)  # (P, I, D) x (roll, pitch, yaw)
-_WIDTH = 31
-
-
-class _Record:
-    """The ground's log, on the vehicle's clock: what was wanted, commanded and learned in each cycle."""
-
-    def __init__(self, recorder: Recorder, flight: Flight, with_weights: bool) -> None:
-        airframe = flight.airframe
-        # Angular acceleration to U_2, U_3 (forces) and U_4 (torque).
-        per_u = np.array(airframe.inertia_kg_m2) / (airframe.arm_m, airframe.arm_m, 1.0)
-        self._with_weights = with_weights
-        columns = [
-            (topics.TRAJECTORY_SETPOINT, lambda v: np.hstack((ned(v[:, 0:3]), ned(v[:, 3:6]), -v[:, 6:7]))),
-            (topics.ATTITUDE_SETPOINT, _attitude_setpoint),
-            (
-                topics.CONTROL_DEMAND,
-                lambda v: np.hstack((v[:, _U1, np.newaxis], v[:, _ACCELERATION] * per_u, v[:, _WIND])),
-            ),
-            (topics.LINK_STATUS, lambda v: v[:, _LINK]),
-        ]
-        if with_weights:
-            by_net = [0, 3, 6, 1, 4, 7, 2, 5, 8]  # from (P, I, D) x (roll, pitch, yaw) to a net after another
-            columns.append((topics.PIDNN_WEIGHTS, lambda v: v[:, _WEIGHTS][:, by_net]))
-        self._block = Block(recorder, _WIDTH, columns)
-
-    def write(
-        self, now_us: int, state: Observer, controller: Controller, thrust: float, counters: Any, lost: int
-    ) -> None:
-        row = self._block.row(state.stamp_us)
-        position, velocity, _, yaw = controller.reference
-        row[_REFERENCE] = (*position, *velocity, yaw)
-        row[_DESIRED] = controller.desired_rad[:, 0]
-        row[_THRUST] = thrust
-        row[_U1] = controller.thrust_n
-        row[_ACCELERATION] = controller.omega_acceleration[:, 0]
-        row[_WIND] = controller.wind_acceleration[:, 0]
-        row[_LINK] = (counters.frames, lost, counters.rejected, state.age_us(now_us) or 0)
-        if self._with_weights and controller.weights is not None:
-            row[_WEIGHTS] = controller.weights.reshape(9)
-
-
-def _attitude_setpoint(values: Array) -> Array:
-    """phi_d, theta_d, psi_d in FRD and PX4's thrust_body, (k, 6)."""
-    zero = np.zeros(len(values))
-    return np.column_stack((*flip_euler(*values[:, _DESIRED].T), zero, zero, -values[:, _THRUST]))
 
 
 def build(flight: Flight, recorder: Any, *, count: int | None = None, **options: Any) -> Any:

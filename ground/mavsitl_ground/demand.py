@@ -1,16 +1,17 @@
-"""Demands to setpoint messages: the ground's frame boundary out.
+"""Demands to setpoint messages.
 
 The stamp of the state it answers is each message's token.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from typing import TypeAlias
 
 from mavsitl.codec import packer
 from mavsitl.dialect import mavlink
-from mavsitl.frames import Quaternion, Vector, flip_quaternion, flip_vector
 from mavsitl.node import Node
+from mavsitl_ground.cycle import Demand
 
 SET_ATTITUDE_TARGET = packer(mavlink.MAVLink_set_attitude_target_message)
 SET_ACTUATOR_CONTROL_TARGET = packer(mavlink.MAVLink_set_actuator_control_target_message)
@@ -25,20 +26,26 @@ RATE_MASK = mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
 Target = tuple[int, int]
 """System and component id."""
 
-
-def send_attitude(node: Node, target: Target, stamp_us: int, attitude: Quaternion, thrust: float) -> None:
-    """q and thrust in SET_ATTITUDE_TARGET; `attitude` FLU -> NWU, thrust 0..1."""
-    q = flip_quaternion(*attitude)
-    node.send(SET_ATTITUDE_TARGET, stamp_us // 1000, *target, ATTITUDE_MASK, q, 0.0, 0.0, 0.0, thrust)
+Send: TypeAlias = Callable[[Node, Target, int, Demand], None]
+"""``send(node, target, stamp_us, demand)`` queues one setpoint."""
 
 
-def send_rates(node: Node, target: Target, stamp_us: int, omega_flu_rad_s: Vector, thrust: float) -> None:
+def send_attitude(node: Node, target: Target, stamp_us: int, demand: Demand) -> None:
+    """Attitude and thrust in SET_ATTITUDE_TARGET."""
+    node.send(SET_ATTITUDE_TARGET, stamp_us // 1000, *target, ATTITUDE_MASK, *demand)
+
+
+def send_rates(node: Node, target: Target, stamp_us: int, demand: Demand) -> None:
     """Body rates and thrust in SET_ATTITUDE_TARGET."""
-    rates = flip_vector(*omega_flu_rad_s)
-    node.send(SET_ATTITUDE_TARGET, stamp_us // 1000, *target, RATE_MASK, (1.0, 0.0, 0.0, 0.0), *rates, thrust)
+    node.send(SET_ATTITUDE_TARGET, stamp_us // 1000, *target, RATE_MASK, *demand)
 
 
-def send_torque(node: Node, target: Target, stamp_us: int, shares: Sequence[float], thrust: float) -> None:
-    """U_2..U_4 as shares of the largest torque (FLU) and U_1 as thrust, in SET_ACTUATOR_CONTROL_TARGET, group 0."""
-    controls = (*flip_vector(shares[0], shares[1], shares[2]), thrust, 0.0, 0.0, 0.0, 0.0)
+def send_torque(node: Node, target: Target, stamp_us: int, demand: Demand) -> None:
+    """U_2..U_4 as shares of the largest torque and U_1 as thrust, in SET_ACTUATOR_CONTROL_TARGET, group 0."""
+    _, roll, pitch, yaw, thrust = demand
+    controls = (roll, pitch, yaw, thrust, 0.0, 0.0, 0.0, 0.0)
     node.send(SET_ACTUATOR_CONTROL_TARGET, stamp_us, 0, *target, controls)
+
+
+SENDS: dict[str, Send] = {"attitude": send_attitude, "body_rate": send_rates, "torque": send_torque}
+"""By the scenario's command level."""

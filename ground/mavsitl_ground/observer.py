@@ -5,45 +5,136 @@ The ground's frame boundary in.
 
 from __future__ import annotations
 
-from math import isfinite
-from typing import Any, Literal, TypeAlias
+from collections.abc import Callable
+from math import isfinite, nan
+from typing import Literal, TypeAlias
 
 import numpy as np
 
+from mavsitl.codec import Frame, reader
+from mavsitl.compiled import compiled, inlined
+from mavsitl.control.arrays import Floats, Record, record
+from mavsitl.control.rotation import euler_rates, normalise, rotate, to_euler
 from mavsitl.dialect import mavlink
-from mavsitl.frames import flip_quaternion, flip_vector
-from mavsitl.quaternion import euler_rates, normalise, rotate, to_euler
+from mavsitl.frames import Quaternion
 
 SPLIT = (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
 ODOMETRY = (mavlink.MAVLINK_MSG_ID_ODOMETRY,)
 Source: TypeAlias = Literal["any", "odometry", "split"]
 NO_OFFSET_US = 1 << 62
 FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
+RESTART_US = 1_000_000
+"""The vehicle's clock goes back by more than this when it has restarted; by less, messages were overtaken."""
+
+LINEAR = ("x", "y", "z", "vx", "vy", "vz")
+ANGULAR = ("rollspeed", "pitchspeed", "yawspeed")
+read_odometry = reader(
+    mavlink.MAVLink_odometry_message,
+    "time_usec", "x", "y", "z", "q", "vx", "vy", "vz", *ANGULAR, "frame_id", "child_frame_id",
+)  # fmt: skip
+read_attitude = reader(mavlink.MAVLink_attitude_quaternion_message, "time_boot_ms", "q1", "q2", "q3", "q4", *ANGULAR)
+read_position = reader(mavlink.MAVLink_local_position_ned_message, "time_boot_ms", *LINEAR)
+read_vector = reader(mavlink.MAVLink_debug_vect_message, "x", "y", "z", "name")
+
+
+@inlined
+def _is_attitude(q: Quaternion, p: float, q_rate: float, r: float) -> bool:
+    """Near unit length and finite."""
+    w, x, y, z = q
+    return abs(w * w + x * x + y * y + z * z - 1.0) <= 0.05 and isfinite(p + q_rate + r)
+
+
+@inlined
+def _is_linear(x: float, y: float, z: float, vx: float, vy: float, vz: float) -> bool:
+    """Finite."""
+    return isfinite(x + y + z + (vx + vy + vz))
+
+
+@inlined
+def _fill_attitude(q: Quaternion, p: float, q_rate: float, r: float, state: Record) -> None:
+    w, x, y, z = q
+    unit = normalise(w, x, -y, -z)
+    angles = to_euler(unit)
+    omega = (p, -q_rate, -r)
+    rates = euler_rates(angles, omega)
+    to = state[0]
+    for part in range(4):
+        to["quaternion"][part, 0] = unit[part]
+    for axis in range(3):
+        to["angles"][axis, 0] = angles[axis]
+        to["omega"][axis, 0] = omega[axis]
+        to["angle_rates"][axis, 0] = rates[axis]
+
+
+@inlined
+def _fill_linear(x: float, y: float, z: float, vx: float, vy: float, vz: float, state: Record) -> None:
+    position, velocity = state[0]["position"], state[0]["velocity"]
+    position[0, 0], position[1, 0], position[2, 0] = x, -y, -z
+    velocity[0, 0], velocity[1, 0], velocity[2, 0] = vx, -vy, -vz
+
+
+@compiled
+def take_attitude(q: Quaternion, p: float, q_rate: float, r: float, newer: bool, state: Record) -> bool:
+    """Attitude FRD -> NED and body rates FRD to the state where they are `newer`; whether they are good."""
+    good = _is_attitude(q, p, q_rate, r)
+    if good and newer:
+        _fill_attitude(q, p, q_rate, r, state)
+    return good
+
+
+@compiled
+def take_linear(x: float, y: float, z: float, vx: float, vy: float, vz: float, newer: bool, state: Record) -> bool:
+    """Position and velocity NED to the state where they are `newer`; whether they are good."""
+    good = _is_linear(x, y, z, vx, vy, vz)
+    if good and newer:
+        _fill_linear(x, y, z, vx, vy, vz, state)
+    return good
+
+
+@compiled
+def take_odometry(
+    x: float, y: float, z: float, q: Quaternion, vx: float, vy: float, vz: float, p: float, q_rate: float, r: float,
+    in_body: bool, newer: bool, state: Record,
+) -> bool:  # fmt: skip
+    """Both; the velocity is FRD where it is `in_body`. One message is one state: half of a bad one is not taken."""
+    good = _is_attitude(q, p, q_rate, r) and _is_linear(x, y, z, vx, vy, vz)
+    if good and newer:
+        if in_body:
+            vx, vy, vz = rotate(normalise(q[0], q[1], q[2], q[3]), (vx, vy, vz))
+        _fill_attitude(q, p, q_rate, r, state)
+        _fill_linear(x, y, z, vx, vy, vz, state)
+    return good
 
 
 class Observer:
-    """State arrays with the fleet axis, n = 1, filled from ODOMETRY or from ATTITUDE_QUATERNION and LOCAL_POSITION_NED.
+    """The vehicle's state, filled from ODOMETRY or from ATTITUDE_QUATERNION and LOCAL_POSITION_NED.
 
     `stamp_us` is the vehicle's clock at the newest attitude; `fresh` says that it is new since `take`.
     """
 
     def __init__(self, source: Source = "any", max_age_us: int = 500_000) -> None:
         """`source`: two streams of one state are not mixed, so the other one is ignored."""
-        self._ignored: tuple[int, ...] = {"any": (), "odometry": SPLIT, "split": ODOMETRY}[source]
         self._max_age_us = max_age_us
-        # One array a message half, written at once; the names below are views of it.
-        self._linear = np.zeros(6)
-        self._angular = np.zeros(13)
-        self._angular[0] = 1.0
-        self.position_nwu_m = self._linear[0:3, np.newaxis]
-        self.velocity_nwu_m_s = self._linear[3:6, np.newaxis]
-        self.quaternion = self._angular[0:4, np.newaxis]
-        self.angles_rad = self._angular[4:7, np.newaxis]
-        self.omega_flu_rad_s = self._angular[7:10, np.newaxis]
-        self.angle_rates_rad_s = self._angular[10:13, np.newaxis]
-        """Time derivatives of `angles_rad`, from the body rates."""
-        self.true_wind_nwu_m_s: np.ndarray[Any, np.dtype[np.float64]] | None = None
-        """From DEBUG_VECT "WIND_TRUE": the oracle's. None until one came."""
+        vector = np.zeros((3, 1))
+        self.state = record(
+            position=vector,
+            velocity=vector,
+            quaternion=[[1.0], [0.0], [0.0], [0.0]],
+            angles=vector,
+            omega=vector,
+            angle_rates=vector,
+            true_wind=vector,
+        )
+        """In one piece what the properties below name, as the compiled controller takes it."""
+        ignored = {"any": (), "odometry": SPLIT, "split": ODOMETRY}[source]
+        handlers: dict[int, Callable[[Frame], None]] = {
+            mavlink.MAVLINK_MSG_ID_ODOMETRY: self._on_odometry,
+            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._on_attitude,
+            mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._on_position,
+            mavlink.MAVLINK_MSG_ID_DEBUG_VECT: self._on_vector,
+        }
+        self.handlers = {key: handler for key, handler in handlers.items() if key not in ignored}
+        """What takes a frame of a message in, by the message's id. One with a non-finite value is not taken."""
         self.reset()
 
     def reset(self) -> None:
@@ -56,7 +147,47 @@ class Observer:
         """Attitudes in a row that had a position of their own stamp; after two the next is waited for too."""
         self._offset_us = NO_OFFSET_US
         self._fresh = False
-        self.true_wind_nwu_m_s = None
+        self.state["true_wind"] = nan
+
+    @property
+    def position_nwu_m(self) -> Floats:
+        """(3, 1), as all vectors here."""
+        position: Floats = self.state["position"][0]
+        return position
+
+    @property
+    def velocity_nwu_m_s(self) -> Floats:
+        velocity: Floats = self.state["velocity"][0]
+        return velocity
+
+    @property
+    def quaternion(self) -> Floats:
+        """FLU -> NWU, (4, 1), unit."""
+        quaternion: Floats = self.state["quaternion"][0]
+        return quaternion
+
+    @property
+    def angles_rad(self) -> Floats:
+        """Z-Y-X roll, pitch, yaw of FLU in NWU."""
+        angles: Floats = self.state["angles"][0]
+        return angles
+
+    @property
+    def omega_flu_rad_s(self) -> Floats:
+        omega: Floats = self.state["omega"][0]
+        return omega
+
+    @property
+    def angle_rates_rad_s(self) -> Floats:
+        """Time derivatives of `angles_rad`, from the body rates."""
+        rates: Floats = self.state["angle_rates"][0]
+        return rates
+
+    @property
+    def true_wind_nwu_m_s(self) -> Floats:
+        """From DEBUG_VECT "WIND_TRUE": the oracle's. NaN until one came."""
+        wind: Floats = self.state["true_wind"][0]
+        return wind
 
     @property
     def fresh(self) -> bool:
@@ -64,8 +195,9 @@ class Observer:
 
         Where both streams are equally fast, an attitude whose position is still on its way is not fresh yet.
         """
-        gap_us = self.stamp_us - self._position_us
-        return self._fresh and self._position_us >= 0 and gap_us <= (0 if self._pairs >= 2 else self._max_age_us)
+        if not self._fresh or self._position_us < 0:
+            return False
+        return self.stamp_us - self._position_us <= (0 if self._pairs >= 2 else self._max_age_us)
 
     def take(self) -> None:
         self._fresh = False
@@ -78,68 +210,65 @@ class Observer:
         """
         if self.stamp_us < 0:
             return None
-        self._offset_us = min(self._offset_us, now_us - self.stamp_us)
-        return now_us - self.stamp_us - self._offset_us
+        offset_us = now_us - self.stamp_us
+        if offset_us < self._offset_us:
+            self._offset_us = offset_us
+        return offset_us - self._offset_us
 
     def valid(self, now_us: int) -> bool:
         age = self.age_us(now_us)
         return age is not None and age <= self._max_age_us
 
-    def receive(self, message: Any) -> None:
-        """A message of the vehicle; others than the four below are ignored, as is one with a non-finite value."""
-        kind = type(message).id
-        if kind in self._ignored:
-            return
-        if kind == mavlink.MAVLINK_MSG_ID_ODOMETRY:
-            self._on_odometry(message)
-        elif kind == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
-            q = (message.q1, message.q2, message.q3, message.q4)
-            rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
-            if _is_attitude(q, rates):
-                self._attitude(q, rates, message.time_boot_ms * 1000)
-        elif kind == mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
-            position, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
-            if isfinite(sum(position) + sum(velocity)):
-                self._position(position, velocity, message.time_boot_ms * 1000)
-        elif kind == mavlink.MAVLINK_MSG_ID_DEBUG_VECT and message.name == "WIND_TRUE":
-            self.true_wind_nwu_m_s = np.array(flip_vector(message.x, message.y, message.z))[:, np.newaxis]
+    def receive(self, frame: Frame) -> None:
+        """A frame of the vehicle; messages without one of the `handlers` are ignored."""
+        handler = self.handlers.get(frame.message_id)
+        if handler is not None:
+            handler(frame)
 
-    def _on_odometry(self, message: Any) -> None:
-        if message.frame_id != mavlink.MAV_FRAME_LOCAL_NED or message.child_frame_id not in FRAMES:
+    def _on_odometry(self, frame: Frame) -> None:
+        stamp_us, x, y, z, q, vx, vy, vz, p, q_rate, r, frame_id, child = read_odometry(frame)
+        if frame_id != mavlink.MAV_FRAME_LOCAL_NED or child not in FRAMES:
             return
-        q = tuple(message.q)
-        rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
-        position, velocity = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
-        # One message is one state: half of a bad one is not taken.
-        if not (_is_attitude(q, rates) and isfinite(sum(position) + sum(velocity))):
+        newer = stamp_us >= self.stamp_us and stamp_us >= self._position_us
+        in_body = child == mavlink.MAV_FRAME_BODY_FRD
+        if not take_odometry(x, y, z, q, vx, vy, vz, p, q_rate, r, in_body, newer, self.state):
             return
-        if message.child_frame_id == mavlink.MAV_FRAME_BODY_FRD:
-            velocity = rotate(normalise(q), velocity)
-        self._attitude(q, rates, message.time_usec)
-        self._position(position, velocity, message.time_usec)
+        if newer:
+            self._attitude_at(stamp_us)
+            self._position_us = stamp_us
+        else:
+            self._late(stamp_us)
 
-    def _attitude(self, q: Any, rates: Any, stamp_us: int) -> None:
-        if stamp_us < self.stamp_us:
-            if self.stamp_us - stamp_us > 1_000_000:
-                self.restarted = True
+    def _on_attitude(self, frame: Frame) -> None:
+        time_ms, w, x, y, z, p, q_rate, r = read_attitude(frame)
+        stamp_us = time_ms * 1000
+        newer = stamp_us >= self.stamp_us
+        if not take_attitude((w, x, y, z), p, q_rate, r, newer, self.state):
             return
+        if newer:
+            self._attitude_at(stamp_us)
+        else:
+            self._late(stamp_us)
+
+    def _on_position(self, frame: Frame) -> None:
+        time_ms, x, y, z, vx, vy, vz = read_position(frame)
+        stamp_us = time_ms * 1000
+        newer = stamp_us >= self._position_us
+        if take_linear(x, y, z, vx, vy, vz, newer, self.state) and newer:
+            self._position_us = stamp_us
+
+    def _on_vector(self, frame: Frame) -> None:
+        x, y, z, name = read_vector(frame)
+        if name == "WIND_TRUE" and isfinite(x + y + z):
+            self.state["true_wind"][0, :, 0] = x, -y, -z
+
+    def _attitude_at(self, stamp_us: int) -> None:
         if stamp_us > self.stamp_us:
             self._pairs = self._pairs + 1 if 0 <= self.stamp_us == self._position_us else 0
-        unit = normalise(flip_quaternion(*q))
-        angles = to_euler(unit)
-        omega = flip_vector(*rates)
-        self._angular[:] = unit + angles + omega + euler_rates(angles, omega)
-        self._fresh = self._fresh or stamp_us > self.stamp_us
+            self._fresh = True
         self.stamp_us = stamp_us
 
-    def _position(self, position: Any, velocity: Any, stamp_us: int) -> None:
-        if stamp_us < self._position_us:
-            return
-        self._linear[:] = flip_vector(*position) + flip_vector(*velocity)
-        self._position_us = stamp_us
-
-
-def _is_attitude(q: Any, rates: Any) -> bool:
-    """Near unit length and finite."""
-    w, x, y, z = q
-    return abs(w * w + x * x + y * y + z * z - 1.0) <= 0.05 and isfinite(sum(rates))
+    def _late(self, stamp_us: int) -> None:
+        """A good attitude that is older than the newest."""
+        if self.stamp_us - stamp_us > RESTART_US:
+            self.restarted = True

@@ -12,6 +12,7 @@ from enum import Enum, auto
 from math import nan
 from typing import Any
 
+from mavsitl.codec import Frame
 from mavsitl.dialect import mavlink
 from mavsitl.services.command import CommandClient
 
@@ -29,6 +30,8 @@ whose clock is seen to go on has not restarted.
 STOP_TIME_US = 120_000_000
 """Longest wait for the vehicle to land and disarm."""
 FORCE_DISARM = 21196.0
+NOW = -(1 << 62)
+"""Of what is due: at once."""
 
 
 class Phase(Enum):
@@ -97,6 +100,14 @@ class Handshake:
         """Flying, and the vehicle follows: a fail-safe or a pilot's mode change ends this, but not the flight."""
         return self.phase is Phase.FLY and self.offboard and self.armed
 
+    @property
+    def due_us(self) -> int:
+        """When `step` may have something to do, unless a message but the state comes before; in flight it is silence
+        alone that is waited for.
+        """
+        quiet = self.phase is Phase.FLY and self.armed and not self._boots and not self._client.busy
+        return self._heard_us + SILENCE_TIMEOUT_US if quiet else NOW
+
     def accepts(self, system_id: int, component_id: int) -> bool:
         """Is this sender the vehicle that is flown?"""
         return self.target == (system_id, component_id)
@@ -121,13 +132,19 @@ class Handshake:
         self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         self.offboard = message.custom_mode >> 16 & 0xFF == PX4_MAIN_MODE_OFFBOARD
 
-    def on_message(self, message: Any, now_us: int) -> None:
+    def on_state(self, newer: bool, now_us: int) -> None:
+        """A position or attitude of the vehicle that is flown; `newer`: by its clock."""
+        self._heard_us = now_us
+        if newer:
+            self.clock_goes_on = True
+
+    def on_message(self, frame: Frame, now_us: int) -> None:
         """From the vehicle that is flown."""
         self._heard_us = now_us
-        if type(message).id == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
-            self.landed_state = message.landed_state
-        elif type(message).id == mavlink.MAVLINK_MSG_ID_COMMAND_ACK:
-            self._client.receive(message)
+        if frame.message_id == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
+            self.landed_state = frame.message.landed_state
+        elif frame.message_id == mavlink.MAVLINK_MSG_ID_COMMAND_ACK:
+            self._client.receive(frame.message)
 
     def lose(self, why: str, now_us: int) -> None:
         """Back to the start: the vehicle fell silent or started anew."""

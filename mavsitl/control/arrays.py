@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,24 @@ Floats: TypeAlias = npt.NDArray[np.float64]
 """C-contiguous float64; another layout is correct too but compiles a second kernel on its first call."""
 
 Counts: TypeAlias = npt.NDArray[np.int64]
+
+
+Record: TypeAlias = npt.NDArray[np.void]
+"""One record, (1,): named numbers, arrays and records in one piece of memory."""
+
+
+def record(**fields: Any) -> Record:
+    """A record of copies of these numbers, arrays and records, under their names.
+
+    One argument of a compiled function in the place of many: each array costs a call 50 ns. The function takes element
+    0 and what it needs by name, ``own = memory[0]; own["integral"]``; compiled or not, that is no copy.
+    """
+    parts = {name: np.asarray(value) for name, value in fields.items()}
+    parts = {name: part.reshape(()) if part.dtype.names else part for name, part in parts.items()}
+    made = np.zeros(1, np.dtype([(name, part.dtype, part.shape) for name, part in parts.items()], align=True))
+    for name, part in parts.items():
+        made[name][0] = part
+    return made
 
 
 def at(vehicle: int | None) -> int | slice:

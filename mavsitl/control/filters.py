@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 
-from mavsitl.compiled import compiled
-from mavsitl.control.arrays import Floats, at
+from mavsitl.compiled import inlined
+from mavsitl.control.arrays import Floats, Record, at, record
 
 
-@compiled
-def _step(value: Floats, share: float, bandwidth: float, state: Floats, rate: Floats) -> None:
+@inlined
+def first_order_step(value: Floats, share: float, bandwidth: float, state: Floats, rate: Floats) -> None:
+    """`FirstOrder.update`: moves `state` (rows, n) towards `value` and fills `rate`."""
     if value.shape != state.shape:
         raise ValueError("the input must have the shape (rows, n) that the filter was built with")
     for row in range(state.shape[0]):
@@ -41,8 +42,12 @@ class FirstOrder:
 
     def update(self, value: Floats) -> Floats:
         """One period: y (rows, n), overwritten by the next call. Raises `ValueError` for a wrong shape."""
-        _step(value, self._share, self._bandwidth, self.value, self.rate)
+        first_order_step(value, self._share, self._bandwidth, self.value, self.rate)
         return self.value
+
+    def record(self) -> Record:
+        """What `first_order_step` takes beside its input, as it stands, by the names of its parameters."""
+        return record(share=self._share, bandwidth=self._bandwidth, state=self.value, rate=self.rate)
 
     def reset(self, vehicle: int | None = None, value: float | Floats = 0.0) -> None:
         """Start one vehicle, or all, at rest at `value` (a number, or an array that fits)."""

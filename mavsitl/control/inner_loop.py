@@ -5,9 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from mavsitl.airframes import Airframe
+from mavsitl.compiled import inlined
 from mavsitl.control.arrays import Floats
 from mavsitl.control.pidnn import AttitudePid, Pidnn
 from mavsitl.scenario import Controller
+
+
+@inlined
+def torque_shares(acceleration: Floats, limit: Floats, shares: Floats) -> None:
+    """`InnerLoop.torque_shares`: fills `shares` (3, n); `limit` (3, 1) is the acceleration of the largest torque."""
+    for axis in range(shares.shape[0]):
+        for i in range(shares.shape[1]):
+            share = acceleration[axis, i] / limit[axis, 0]
+            if share > 1.0:
+                share = 1.0
+            elif share < -1.0:
+                share = -1.0
+            shares[axis, i] = share
 
 
 class InnerLoop:
@@ -23,7 +37,8 @@ class InnerLoop:
             )
         else:
             self.law = AttitudePid(controller.roll_pitch, controller.yaw, period_s, controller.derivative, limits, n)
-        self._per_share = np.array(limits)[:, np.newaxis]
+        self.limit = np.array(limits)[:, np.newaxis].copy()
+        """Angular acceleration of the airframe's largest torque, rad/s^2, (3, 1)."""
         self._inertia = np.array(inertia)[:, np.newaxis]
 
     @property
@@ -43,7 +58,8 @@ class InnerLoop:
 
     def torque_shares(self, acceleration_rad_s2: Floats) -> Floats:
         """(3, n) in -1..1: shares of the airframe's largest torque, eqs 11 and 12 with the torque's arm included."""
-        shares: Floats = np.clip(acceleration_rad_s2 / self._per_share, -1.0, 1.0)
+        shares: Floats = np.empty_like(acceleration_rad_s2)
+        torque_shares(acceleration_rad_s2, self.limit, shares)
         return shares
 
     def torque_n_m(self, acceleration_rad_s2: Floats) -> Floats:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from mavsitl.compiled import compiled
-from mavsitl.control.arrays import Floats, at
+from mavsitl.control.arrays import Floats, Record, at, record
 from mavsitl.scenario import Gains
 
 LEAST_VERTICAL_SHARE = 0.1
@@ -15,7 +15,7 @@ LEAST_VERTICAL_SHARE = 0.1
 
 
 @compiled
-def _step(
+def position_step(
     position: Floats,
     velocity: Floats,
     quaternion: Floats,
@@ -28,6 +28,7 @@ def _step(
     integral: Floats,
     out: Floats,
 ) -> None:
+    """`PositionLoop.update`: fills `out` (3, n), U_1, phi_d, theta_d. The last three are `PositionLoop.record`'s."""
     n = integral.shape[1]
     if (
         position.shape != integral.shape
@@ -201,7 +202,7 @@ class PositionLoop:
 
         Raises `ValueError` for a wrong shape.
         """
-        _step(
+        position_step(
             position_nwu_m,
             velocity_nwu_m_s,
             quaternion,
@@ -215,6 +216,10 @@ class PositionLoop:
             self._out,
         )
         return self._outputs
+
+    def record(self) -> Record:
+        """What `position_step` takes beside its inputs, as it stands, by the names of its parameters."""
+        return record(parameters=self._parameters, integral=self.integral_m_s, out=self._out)
 
     def reset(self, vehicle: int | None = None) -> None:
         """Empty the integrators of one vehicle, or of all."""

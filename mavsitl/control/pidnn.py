@@ -20,8 +20,8 @@ from typing import Literal
 
 import numpy as np
 
-from mavsitl.compiled import compiled
-from mavsitl.control.arrays import Counts, Floats, at
+from mavsitl.compiled import compiled, inlined
+from mavsitl.control.arrays import Counts, Floats, Record, at, record
 from mavsitl.scenario import Gains, Learning, Vector3
 
 Derivative = Literal["rate", "difference"]
@@ -31,14 +31,14 @@ TURN = 2.0 * math.pi
 UNLIMITED: Vector3 = (math.inf, math.inf, math.inf)
 
 
-@compiled
+@inlined
 def _short_way(angle: float) -> float:
     """The same angle in [-pi, pi); one that lies there already comes back bit for bit."""
     turned: float = angle - TURN * np.floor((angle + math.pi) / TURN)
     return turned
 
 
-@compiled
+@inlined
 def _check(angles: Floats, rates: Floats, desired: Floats, desired_rates: Floats, out: Floats) -> None:
     if (
         angles.shape != out.shape
@@ -50,7 +50,7 @@ def _check(angles: Floats, rates: Floats, desired: Floats, desired_rates: Floats
 
 
 @compiled
-def _pid_step(
+def pid_step(
     angles: Floats,
     rates: Floats,
     desired: Floats,
@@ -62,6 +62,7 @@ def _pid_step(
     memory: Floats,
     out: Floats,
 ) -> None:
+    """`AttitudePid.update`: fills `out` (3, n). From `by_rate` on all are `AttitudePid.record`'s."""
     _check(angles, rates, desired, desired_rates, out)
     for axis in range(3):
         for i in range(out.shape[1]):
@@ -89,7 +90,7 @@ def _pid_step(
 
 
 @compiled
-def _net_step(
+def net_step(
     angles: Floats,
     rates: Floats,
     desired: Floats,
@@ -109,6 +110,7 @@ def _net_step(
     hidden: Floats,
     out: Floats,
 ) -> None:
+    """`Pidnn.update`: fills `out` (3, n). But for `learn` all from `by_rate` on are `Pidnn.record`'s."""
     _check(angles, rates, desired, desired_rates, out)
     period = settings[0]
     bound = settings[1]
@@ -277,7 +279,7 @@ class AttitudePid:
         learn: bool = True,
     ) -> Floats:
         """As `Pidnn.update`; there is nothing to learn, whatever `learn` says."""
-        _pid_step(
+        pid_step(
             angles_rad,
             omega_flu_rad_s,
             desired_rad,
@@ -290,6 +292,17 @@ class AttitudePid:
             self.demand_flu_rad_s2,
         )
         return self.demand_flu_rad_s2
+
+    def record(self) -> Record:
+        """What `pid_step` takes beside its inputs, as it stands, by the names of its parameters."""
+        return record(
+            by_rate=self._by_rate,
+            period=self._period,
+            limit=self._limit,
+            gains=self._gains,
+            memory=self._memory,
+            out=self.demand_flu_rad_s2,
+        )
 
     def reset(self, vehicle: int | None = None) -> None:
         """Empty the sums and forget the last errors of one vehicle, or of all."""
@@ -379,7 +392,7 @@ class Pidnn:
         body rate; `desired_rates_rad_s` (3, n), None for 0, enters only with the ``rate`` derivative. `learn` False
         leaves all weights alone, leakage included. Raises `ValueError` for a wrong shape.
         """
-        _net_step(
+        net_step(
             angles_rad,
             omega_flu_rad_s,
             desired_rad,
@@ -400,6 +413,24 @@ class Pidnn:
             self.demand_flu_rad_s2,
         )
         return self.demand_flu_rad_s2
+
+    def record(self) -> Record:
+        """What `net_step` takes beside its inputs and `learn`, as it stands, by the names of its parameters."""
+        return record(
+            by_rate=self._by_rate,
+            learn_inputs=self._learn_inputs,
+            known_sign=self._known_sign,
+            guarded=self._guarded,
+            settings=self._settings,
+            initial=self.initial,
+            memory=self._memory,
+            weights=self.weights,
+            input_weights=self.input_weights,
+            bounded=self.rate_bounded,
+            input_bounded=self.input_rate_bounded,
+            hidden=self.hidden,
+            out=self.demand_flu_rad_s2,
+        )
 
     def reset(self, vehicle: int | None = None) -> None:
         """Start again as the identical PID (eqs 38, 39), one vehicle or all: weights, neurons, counters."""

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from mavsitl.compiled import compiled
-from mavsitl.control.arrays import Floats, at
+from mavsitl.compiled import compiled, inlined
+from mavsitl.control.arrays import Floats, Record, at, record
 
 
 @compiled
-def _step(
+def observer_step(
     velocity: Floats,
     model: Floats,
     period: float,
@@ -21,6 +21,7 @@ def _step(
     started: Floats,
     wind: Floats,
 ) -> None:
+    """`WindObserver.update`: moves `wind` (3, n). The last five are `WindObserver.record`'s."""
     if velocity.shape != wind.shape or model.shape != wind.shape:
         raise ValueError("velocity and model acceleration must have shape (3, n)")
     for axis in range(3):
@@ -38,8 +39,9 @@ def _step(
         started[i] = 1.0
 
 
-@compiled
-def _model(quaternion: Floats, thrust: Floats, mass: float, gravity: float, out: Floats) -> None:
+@inlined
+def model_step(quaternion: Floats, thrust: Floats, mass: float, gravity: float, out: Floats) -> None:
+    """See `model_acceleration`."""
     n = out.shape[1]
     if quaternion.shape[0] != 4 or quaternion.shape[1] != n or thrust.shape[0] != n or out.shape[0] != 3:
         raise ValueError("the quaternion must have shape (4, n), the thrust (n,), the output (3, n)")
@@ -61,7 +63,7 @@ def model_acceleration(
 
     quaternion (4, n), scalar first, FLU to NWU, unit; thrust (n,). Raises `ValueError` for a wrong shape.
     """
-    _model(quaternion, thrust_n, mass_kg, gravity_m_s2, out)
+    model_step(quaternion, thrust_n, mass_kg, gravity_m_s2, out)
     return out
 
 
@@ -94,7 +96,7 @@ class WindObserver:
         `period_s` that ends now. A period of 0 or less (the same telemetry twice) changes nothing. The first call after
         `reset` only sets z = v. Raises `ValueError` for a wrong shape.
         """
-        _step(
+        observer_step(
             velocity_nwu_m_s,
             model_acceleration_nwu_m_s2,
             period_s,
@@ -105,6 +107,16 @@ class WindObserver:
             self.acceleration_nwu_m_s2,
         )
         return self.acceleration_nwu_m_s2
+
+    def record(self) -> Record:
+        """What `observer_step` takes beside its inputs, as it stands, by the names of its parameters."""
+        return record(
+            horizontal=self._horizontal,
+            vertical=self._vertical,
+            last_velocity=self._last_velocity,
+            started=self._started,
+            wind=self.acceleration_nwu_m_s2,
+        )
 
     def reset(self, vehicle: int | None = None) -> None:
         """W = 0 and z = v at the next update, for one vehicle or all: wherever other forces act (ground, clamp)."""

@@ -121,6 +121,11 @@ class Joiner:
         self._timeout_us = timeout_us
         self._senders: OrderedDict[Peer, OrderedDict[int, _Parts]] = OrderedDict()
 
+    @property
+    def waiting(self) -> bool:
+        """Whether there is a text that `step` may give up."""
+        return bool(self._senders)
+
     def receive(self, message: Message, sender: Peer, now_us: int) -> Sequence[Text]:
         """A STATUSTEXT; the texts that are ready by it."""
         part: str = message.text

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mavsitl import codec
 from mavsitl.codec import Message, MessageClass, encode, parse
 from mavsitl.dialect import mavlink
-from tests.wire.reference import CLASSES, NAMES, assert_same_message, frame_v1, frame_v2, pymavlink
+from tests.wire.reference import CLASSES, NAMES, address_of, assert_same_message, frame_v1, frame_v2, pymavlink
 
 few = settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 STATUSTEXT = mavlink.MAVLink_statustext_message(6, b"armed", 3, 1)
