@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavsitl import __version__
+from mavsitl import __version__, process
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mavsitl.ask import Reply, Task
     from mavsitl.check import Heard, PortReport, Report
     from mavsitl.ends import Outcome
+    from mavsitl.realtime import Wish
     from mavsitl.report.run import FlightRecord
     from mavsitl.scenario import Flight
 
@@ -237,6 +238,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if run is None:
         parser.print_help()
         return EXIT_USAGE
+    process.one_blas_thread()
     try:
         return run(options)
     except KeyboardInterrupt as interrupt:
@@ -262,13 +264,14 @@ def _exit_code(error: Exception) -> int | None:
     from mavsitl.link.base import LinkError
     from mavsitl.log.errors import LogError
     from mavsitl.pair import PairError
+    from mavsitl.realtime import RealTimeError
     from mavsitl.report.run import RunError
     from mavsitl.scenario import ScenarioError
     from mavsitl.wings import WingError
 
     if isinstance(error, (UsageError, ExposedError, ScenarioError, ChaosError, AddressError, WingError)):
         return EXIT_USAGE
-    return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RunError)) else None
+    return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RealTimeError, RunError)) else None
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -431,6 +434,14 @@ def _add_vehicle(commands: Any) -> None:
         help="misbehave in this way, NAME[:ARGUMENT...][@PORT]; 'mavsitl chaos' lists all; may be repeated",
     )  # fmt: skip
     parser.add_argument("--until-disarmed", action="store_true", default=None, help="end after the first flight")
+    parser.add_argument(
+        "--realtime", action="store_true", default=None,
+        help="keep the time on a busy machine: a real-time priority and locked memory (Linux, where it is allowed)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--best-effort", action="store_true", default=None,
+        help="with --realtime: go on without what is not allowed, and say what that is",
+    )  # fmt: skip
     parser.set_defaults(run=_vehicle)
 
 
@@ -885,6 +896,7 @@ def _with_chaos(flight: Flight, modes: Sequence[str]) -> Flight:
     return msgspec.structs.replace(flight, scenario=scenario)
 
 
+@process.starting()
 def _vehicle(options: argparse.Namespace) -> int:
     from mavsitl import ends
 
@@ -908,10 +920,11 @@ def _vehicle(options: argparse.Namespace) -> int:
         options,
         real_time_only=(
             "--speed", "--until-disarmed", "--gcs-port", "--gcs-remote", "--tcp-port", "--state-dir", "--no-state",
-            "--chaos",
+            "--chaos", "--realtime", "--best-effort",
         ),
         lockstep_only=("--deadline", "--cpu"),
     )  # fmt: skip
+    wish = _wish_for_real_time(options)
     status = _Status(options.status == "json")
     if options.lockstep:
         outcome = ends.vehicle_lockstep(
@@ -936,12 +949,28 @@ def _vehicle(options: argparse.Namespace) -> int:
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
             until_finished=bool(options.until_disarmed), state=_state_folder(options, system_id),
-            report=status.say, stop=status.stop, progress=None,
+            report=status.say, stop=status.stop, progress=None, wish=wish,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK
 
 
+def _wish_for_real_time(options: argparse.Namespace) -> Wish:
+    from mavsitl.realtime import Wish
+
+    if options.best_effort and not options.realtime:
+        raise UsageError("--best-effort: only with --realtime")
+    if not options.realtime:
+        return Wish.ORDINARY
+    if options.speed is not None and options.speed > 1.0:
+        raise UsageError(
+            f"--realtime: not with --speed {options.speed:g}: a vehicle faster than the machine would hold its core "
+            "from everything else; allowed: 1 or less"
+        )
+    return Wish.BEST_EFFORT if options.best_effort else Wish.DEMANDED
+
+
+@process.starting()
 def _ground(options: argparse.Namespace) -> int:
     from mavsitl import ends
     from mavsitl.link.address import parse_address

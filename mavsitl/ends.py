@@ -13,7 +13,7 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mavsitl import __version__, drivers, wings
+from mavsitl import __version__, drivers, process, realtime, wings
 from mavsitl.clock import monotonic_us, unix_us
 from mavsitl.drivers import Progress, RealTime, Tap
 from mavsitl.herald import Herald
@@ -314,10 +314,11 @@ def vehicle_lockstep(
             watch = _Watch(core)
             channels = _channels(flight)
             _watch_lockstep_link(core, channels, recorder, tap)
-            end_us = drivers.run_lockstep_vehicle(
-                core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
-                channels=channels, max_time_s=flight.scenario.duration_s + IMPAIRED_GRACE_S,
-            )  # fmt: skip
+            with process.flying():
+                end_us = drivers.run_lockstep_vehicle(
+                    core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
+                    channels=channels, max_time_s=flight.scenario.duration_s + IMPAIRED_GRACE_S,
+                )  # fmt: skip
             return watch.outcome(end_us, tap, links=_statistics(channels))
     finally:
         link.close()
@@ -341,10 +342,11 @@ def ground_lockstep(
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
-            end_us = drivers.run_lockstep_ground(
-                core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
-                impaired=flight.scenario.impaired,
-            )  # fmt: skip
+            with process.flying():
+                end_us = drivers.run_lockstep_ground(
+                    core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
+                    impaired=flight.scenario.impaired,
+                )  # fmt: skip
             return watch.outcome(end_us, tap)
     finally:
         link.close()
@@ -354,12 +356,16 @@ def vehicle_realtime(
     flight: Flight, links: VehicleLinks, folder: Path | None, *,
     system_id: int, wing: str | None, speed: float, until_finished: bool, state: Path | None,
     report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
+    wish: realtime.Wish = realtime.Wish.ORDINARY,
 ) -> Outcome:  # fmt: skip
-    """The vehicle on the wall clock, with PX4 SITL's two links and TCP where asked for. Raises as `vehicle_lockstep`.
+    """The vehicle on the wall clock, with PX4 SITL's two links and TCP where asked for.
 
     `state` is the folder of what outlives the process, None: nothing does. `report` is told what went wrong on the
-    machine, and so are the links: logs that cannot be written any more, real time that was not kept.
+    machine, and so are the links: logs that cannot be written any more, real time that was not kept. `wish`: of the
+    system, see `mavsitl.realtime`.
+    Raises as `vehicle_lockstep`, and `RealTimeError`.
     """
+    realtime.check(wish)
     opened: list[Link] = []
     core: Any = None
 
@@ -412,10 +418,12 @@ def vehicle_realtime(
             except ExposedError:
                 core.close()
                 raise
-            timing = drivers.run_realtime_vehicle(
-                core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, say=report,
-                progress=progress, due_s=live.due_s,
-            )  # fmt: skip
+            with process.flying(), realtime.claim(wish, report):
+                realtime.fine_timers()
+                timing = drivers.run_realtime_vehicle(
+                    core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, say=report,
+                    progress=progress, due_s=live.due_s,
+                )  # fmt: skip
             return watch.outcome(timing.simulated_us, tap, timing, links=live.statistics())
     finally:
         for link in opened:
@@ -438,9 +446,10 @@ def ground_realtime(
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
-            simulated_us, wall_us = drivers.run_realtime_ground(
-                core, link, tap, stop=stop, say=report, progress=progress
-            )
+            with process.flying():
+                simulated_us, wall_us = drivers.run_realtime_ground(
+                    core, link, tap, stop=stop, say=report, progress=progress
+                )
             return watch.outcome(simulated_us, tap, wall_us=wall_us)
     finally:
         link.close()
