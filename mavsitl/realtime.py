@@ -26,8 +26,8 @@ _CAP_IPC_LOCK = 14
 
 _NO_FIFO = (
     f"a real-time priority (SCHED_FIFO {PRIORITY}) is not allowed here. For a user: a line "
-    f"'@GROUP - rtprio {PRIORITY}' in /etc/security/limits.d/ and a new login; for a service: LimitRTPRIO={PRIORITY}; in a container: "
-    f"--cap-add SYS_NICE, or --ulimit rtprio={PRIORITY}"
+    f"'@GROUP - rtprio {PRIORITY}' in /etc/security/limits.d/ and a new login; for a service: LimitRTPRIO={PRIORITY}; "
+    f"in a container: --cap-add SYS_NICE, or --ulimit rtprio={PRIORITY}"
 )
 _NO_LOCK = (
     "locking memory (mlockall) is not allowed here. For a user: a line '@GROUP - memlock unlimited' in "
