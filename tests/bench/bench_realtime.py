@@ -25,7 +25,7 @@ from time import perf_counter
 from mavsitl import realtime
 from mavsitl.realtime import RealTimeError, Wish
 from tests.bench.bench_latency import idle
-from tests.bench.live import live
+from tests.bench.live import installed, live
 
 BURNER = "while True: pass"
 
@@ -62,9 +62,9 @@ def memory_kb(pid: int) -> dict[str, int]:
     return {line.partition(":")[0]: int(line.split()[1]) for line in lines}
 
 
-def measure(options: Sequence[str], seconds: float, burning: int) -> Kept:
+def measure(options: Sequence[str], seconds: float, burning: int, environment: dict[str, str]) -> Kept:
     """Of one vehicle, standing, for so many seconds after it is ready."""
-    with live(*options) as vehicle:
+    with live(*options, environment=environment) as vehicle:
         vehicle.wait_ready()
         with burners(burning):
             begin_s, cpu_s = perf_counter(), vehicle.cpu_now_s()
@@ -117,9 +117,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     plan = rows()
     found: dict[str, list[Kept]] = {name: [] for name in plan}
-    for _ in range(options.repeats):
-        for name, (arguments, burning) in plan.items():
-            found[name].append(measure(arguments, options.seconds, burning))
+    with installed() as environment:
+        measure([], 0.0, 0, environment)  # writes what the others find
+        for _ in range(options.repeats):
+            for name, (arguments, burning) in plan.items():
+                found[name].append(measure(arguments, options.seconds, burning, environment))
     if options.json:
         print(json.dumps({name: [asdict(run) for run in runs] for name, runs in found.items()}, indent=1))
     else:
