@@ -43,6 +43,24 @@ def test_a_process_that_flies_never_loads_what_only_reports_need(end: str, wing:
     assert said == ""
 
 
+@pytest.mark.sockets
+def test_the_first_word_is_said_before_anything_heavy_is_loaded() -> None:
+    """By the command itself, up to the first datagram that it sends."""
+    said = run(
+        "import sys, os\n"
+        "from mavsitl import cli\n"
+        "from mavsitl.link.udp import UdpLink\n"
+        "def send(link, datagram):\n"
+        "    heavy = {'numpy', 'numba', 'llvmlite', 'ctypes', 'pyulog', *NEVER} & set(sys.modules)\n"
+        "    print('heavy:', *sorted(heavy), flush=True)\n"
+        "    os._exit(0)\n"
+        "UdpLink.send = send\n"
+        f"NEVER = {NEVER!r}\n"
+        "cli.main(['vehicle', '--no-state', '--offboard-port', '0', '--gcs-port', '0', '--status', 'json'])"
+    )
+    assert said.splitlines()[-1] == "heavy:"
+
+
 def test_scipy_comes_when_a_kernel_multiplies_matrices() -> None:
     said = run(
         "import sys, numpy as np, mavsitl.compiled, numba\n"
