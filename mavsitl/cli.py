@@ -434,14 +434,6 @@ def _add_vehicle(commands: Any) -> None:
         help="misbehave in this way, NAME[:ARGUMENT...][@PORT]; 'mavsitl chaos' lists all; may be repeated",
     )  # fmt: skip
     parser.add_argument("--until-disarmed", action="store_true", default=None, help="end after the first flight")
-    parser.add_argument(
-        "--realtime", action="store_true", default=None,
-        help="keep the time on a busy machine: a real-time priority and locked memory (Linux, where it is allowed)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--best-effort", action="store_true", default=None,
-        help="with --realtime: go on without what is not allowed, and say what that is",
-    )  # fmt: skip
     parser.set_defaults(run=_vehicle)
 
 
@@ -487,6 +479,14 @@ def _add_end_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="lock-step: run on this CPU from the first exchange on; the same for both is fastest",
     )
+    group.add_argument(
+        "--realtime", action="store_true", default=None,
+        help="keep the time on a busy machine: a real-time priority and locked memory (Linux, where it is allowed)",
+    )  # fmt: skip
+    group.add_argument(
+        "--best-effort", action="store_true", default=None,
+        help="with --realtime: go on without what is not allowed, and say what that is",
+    )  # fmt: skip
     group.add_argument("--run-dir", type=Path, metavar="DIR", help="write logs there (default: none)")
     group.add_argument("--wing", metavar="NAME", help="another installed vehicle or controller, by its entry point")
     group.add_argument(
@@ -962,9 +962,10 @@ def _wish_for_real_time(options: argparse.Namespace) -> Wish:
         raise UsageError("--best-effort: only with --realtime")
     if not options.realtime:
         return Wish.ORDINARY
-    if options.speed is not None and options.speed > 1.0:
+    speed = getattr(options, "speed", None) or 1.0
+    if speed > 1.0:
         raise UsageError(
-            f"--realtime: not with --speed {options.speed:g}: a vehicle faster than the machine would hold its core "
+            f"--realtime: not with --speed {speed:g}: a vehicle faster than the machine would hold its core "
             "from everything else; allowed: 1 or less"
         )
     return Wish.BEST_EFFORT if options.best_effort else Wish.DEMANDED
@@ -978,7 +979,10 @@ def _ground(options: argparse.Namespace) -> int:
     flight = _load(options.scenario, _settings(options))
     address = parse_address(options.link)
     _check_effect(options, "ground", ("--seed",))
-    _check_lockstep(options, real_time_only=(), lockstep_only=("--deadline", "--cpu", "--vehicle"))
+    _check_lockstep(
+        options, real_time_only=("--realtime", "--best-effort"), lockstep_only=("--deadline", "--cpu", "--vehicle")
+    )
+    wish = _wish_for_real_time(options)
     status = _Status(options.status == "json")
     if options.lockstep:
         if not address.kind.startswith("udp"):
@@ -995,6 +999,7 @@ def _ground(options: argparse.Namespace) -> int:
         outcome = ends.ground_realtime(
             flight, address, options.run_dir,
             vehicle_system_id=options.system, wing=options.wing, report=status.say, stop=status.stop, progress=None,
+            wish=wish,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED

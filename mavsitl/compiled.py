@@ -51,7 +51,7 @@ def _import_numba() -> Any:
     finally:
         if not scipy_is_loaded:
             del sys.modules["scipy"]
-    ensure_blas = linalg.ensure_blas
+    ensure_blas = getattr(linalg, "ensure_blas", None)  # where a later numba has none, there is nothing to put off
     linalg.ensure_blas = lambda: None
     try:
         import numba.np.arraymath

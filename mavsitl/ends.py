@@ -438,15 +438,17 @@ def ground_realtime(
     flight: Flight, address: Address, folder: Path | None, *,
     vehicle_system_id: int | None, wing: str | None,
     report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
+    wish: realtime.Wish = realtime.Wish.ORDINARY,
 ) -> Outcome:  # fmt: skip
-    """The ground on the wall clock, on any endpoint. Raises as `vehicle_lockstep`."""
+    """The ground on the wall clock, on any endpoint. Raises as `vehicle_realtime`."""
+    realtime.check(wish)
     link = open_link(address, port_option="--link udpin:HOST:PORT", host_option="--link udpin:HOST:PORT")
     try:
         with _logs(folder, "ground", flight, lambda error: report(f"logging has ended: {error}")) as (recorder, tap):
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
-            with process.flying():
+            with process.flying(), realtime.claim(wish, report):
                 simulated_us, wall_us = drivers.run_realtime_ground(
                     core, link, tap, stop=stop, say=report, progress=progress
                 )

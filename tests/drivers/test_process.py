@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-import resource
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -149,7 +148,7 @@ class System:
         monkeypatch.setattr(realtime, "_may_lock", lambda: allows)
         monkeypatch.setattr(realtime, "_libc", lambda: self)
         self.nice_limit = 0
-        monkeypatch.setattr(resource, "getrlimit", lambda which: (self.nice_limit, 40))
+        monkeypatch.setattr("resource.getrlimit", lambda which: (self.nice_limit, 40))
 
     def _set_scheduler(self, pid: int, policy: int, parameter: Any) -> None:
         if not self._allows:
@@ -211,21 +210,25 @@ def test_nothing_is_asked_for_by_default(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.parametrize(
     ("arguments", "blamed"),
     [
-        (["--best-effort"], "--best-effort: only with --realtime"),
-        (["--realtime", "--speed", "2"], "--realtime: not with --speed 2"),
-        (["--realtime", "--lockstep"], "--realtime: not with --lockstep"),
+        (["vehicle", "--best-effort"], "--best-effort: only with --realtime"),
+        (["vehicle", "--realtime", "--speed", "2"], "--realtime: not with --speed 2"),
+        (["vehicle", "--realtime", "--lockstep"], "--realtime: not with --lockstep"),
+        (["ground", "--best-effort"], "--best-effort: only with --realtime"),
+        (["ground", "--realtime", "--lockstep"], "--realtime: not with --lockstep"),
     ],
 )
 def test_options_that_do_not_go_together(arguments: list[str], blamed: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["vehicle", *arguments]) == cli.EXIT_USAGE
+    assert cli.main(arguments) == cli.EXIT_USAGE
     assert blamed in capsys.readouterr().err
 
 
 @linux
-def test_a_vehicle_that_may_not_says_so_before_it_opens_a_port(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("arguments", [["vehicle", "--no-state"], ["ground"]], ids=["vehicle", "ground"])
+def test_an_end_that_may_not_says_so_before_it_opens_a_port(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     System(monkeypatch, allows=False)
     monkeypatch.setattr("mavsitl.ends.UdpLink", None)
-    assert cli.main(["vehicle", "--realtime", "--no-state"]) == cli.EXIT_FAILED
+    monkeypatch.setattr("mavsitl.ends.open_link", None)
+    assert cli.main([*arguments, "--realtime"]) == cli.EXIT_FAILED
     assert "LimitRTPRIO=20" in capsys.readouterr().err
