@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavsitl import __version__
+from mavsitl import __version__, process
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mavsitl.ends import Outcome, VehicleLinks
     from mavsitl.fleet import FleetOutcome
     from mavsitl.link.address import Address
+    from mavsitl.realtime import Wish
     from mavsitl.report.run import FlightRecord
     from mavsitl.scenario import Flight
 
@@ -245,6 +246,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if run is None:
         parser.print_help()
         return EXIT_USAGE
+    process.one_blas_thread()
     try:
         return run(options)
     except KeyboardInterrupt as interrupt:
@@ -270,13 +272,14 @@ def _exit_code(error: Exception) -> int | None:
     from mavsitl.link.base import LinkError
     from mavsitl.log.errors import LogError
     from mavsitl.pair import PairError
+    from mavsitl.realtime import RealTimeError
     from mavsitl.report.run import RunError
     from mavsitl.scenario import ScenarioError
     from mavsitl.wings import WingError
 
     if isinstance(error, (UsageError, ExposedError, ScenarioError, ChaosError, AddressError, WingError)):
         return EXIT_USAGE
-    return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RunError)) else None
+    return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RealTimeError, RunError)) else None
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -509,6 +512,14 @@ def _add_end_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="lock-step: run on this CPU from the first exchange on; the same for both is fastest",
     )
+    group.add_argument(
+        "--realtime", action="store_true", default=None,
+        help="keep the time on a busy machine: a real-time priority and locked memory (Linux, where it is allowed)",
+    )  # fmt: skip
+    group.add_argument(
+        "--best-effort", action="store_true", default=None,
+        help="with --realtime: go on without what is not allowed, and say what that is",
+    )  # fmt: skip
     group.add_argument("--run-dir", type=Path, metavar="DIR", help="write logs there (default: none)")
     group.add_argument("--wing", metavar="NAME", help="another installed vehicle or controller, by its entry point")
     group.add_argument(
@@ -999,7 +1010,9 @@ def _check_fleet(options: argparse.Namespace, system_id: int) -> int:
     return count
 
 
-def _fleet(options: argparse.Namespace, flight: Flight, first: VehicleLinks, system_id: int, count: int) -> int:
+def _fleet(
+    options: argparse.Namespace, flight: Flight, first: VehicleLinks, system_id: int, count: int, wish: Wish
+) -> int:
     """`first`: the links of the first vehicle."""
     import dataclasses
 
@@ -1038,7 +1051,7 @@ def _fleet(options: argparse.Namespace, flight: Flight, first: VehicleLinks, sys
     outcome = ends.fleet_realtime(
         flight, links, options.run_dir, count=count, system_id=system_id, wing=options.wing,
         speed=options.speed or 1.0, until_finished=bool(options.until_disarmed),
-        states=_fleet_states(options, system_id, count), report=status.say, stop=status.stop, progress=None,
+        states=_fleet_states(options, system_id, count), report=status.say, stop=status.stop, progress=None, wish=wish,
     )  # fmt: skip
     status.end_fleet(outcome)
     return EXIT_OK
@@ -1059,6 +1072,7 @@ def _with_chaos(flight: Flight, modes: Sequence[str]) -> Flight:
     return msgspec.structs.replace(flight, scenario=scenario)
 
 
+@process.starting()
 def _vehicle(options: argparse.Namespace) -> int:
     from mavsitl import ends
 
@@ -1082,12 +1096,13 @@ def _vehicle(options: argparse.Namespace) -> int:
         options,
         real_time_only=(
             "--speed", "--until-disarmed", "--gcs-port", "--gcs-remote", "--tcp-port", "--state-dir", "--no-state",
-            "--chaos",
+            "--chaos", "--realtime", "--best-effort",
         ),
         lockstep_only=("--deadline", "--cpu"),
     )  # fmt: skip
+    wish = _wish_for_real_time(options)
     if count := _check_fleet(options, system_id):
-        return _fleet(options, flight, links, system_id, count)
+        return _fleet(options, flight, links, system_id, count, wish)
     status = _Status(options.status == "json")
     if options.lockstep:
         outcome = ends.vehicle_lockstep(
@@ -1112,12 +1127,29 @@ def _vehicle(options: argparse.Namespace) -> int:
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
             until_finished=bool(options.until_disarmed), state=_state_folder(options, system_id),
-            report=status.say, stop=status.stop, progress=None,
+            report=status.say, stop=status.stop, progress=None, wish=wish,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK
 
 
+def _wish_for_real_time(options: argparse.Namespace) -> Wish:
+    from mavsitl.realtime import Wish
+
+    if options.best_effort and not options.realtime:
+        raise UsageError("--best-effort: only with --realtime")
+    if not options.realtime:
+        return Wish.ORDINARY
+    speed = getattr(options, "speed", None) or 1.0
+    if speed > 1.0:
+        raise UsageError(
+            f"--realtime: not with --speed {speed:g}: a vehicle faster than the machine would hold its core "
+            "from everything else; allowed: 1 or less"
+        )
+    return Wish.BEST_EFFORT if options.best_effort else Wish.DEMANDED
+
+
+@process.starting()
 def _ground(options: argparse.Namespace) -> int:
     from mavsitl import ends
     from mavsitl.link.address import parse_address
@@ -1125,10 +1157,13 @@ def _ground(options: argparse.Namespace) -> int:
     flight = _load(options.scenario, _settings(options))
     address = parse_address(options.link) if options.link else ends.ground_address(options.instance)
     _check_effect(options, "ground", ("--seed",))
-    _check_lockstep(options, real_time_only=(), lockstep_only=("--deadline", "--cpu", "--vehicle"))
+    _check_lockstep(
+        options, real_time_only=("--realtime", "--best-effort"), lockstep_only=("--deadline", "--cpu", "--vehicle")
+    )
+    wish = _wish_for_real_time(options)
     first_id = options.system if options.system is not None else options.instance + 1
     if count := _check_fleet(options, first_id):
-        return _ground_fleet(options, flight, address, first_id, count)
+        return _ground_fleet(options, flight, address, first_id, count, wish)
     status = _Status(options.status == "json")
     if options.lockstep:
         if not address.kind.startswith("udp"):
@@ -1145,12 +1180,15 @@ def _ground(options: argparse.Namespace) -> int:
         outcome = ends.ground_realtime(
             flight, address, options.run_dir,
             vehicle_system_id=options.system, wing=options.wing, report=status.say, stop=status.stop, progress=None,
+            wish=wish,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED
 
 
-def _ground_fleet(options: argparse.Namespace, flight: Flight, first: Address, system_id: int, count: int) -> int:
+def _ground_fleet(
+    options: argparse.Namespace, flight: Flight, first: Address, system_id: int, count: int, wish: Wish
+) -> int:
     """`first`: where the first vehicle, or all of them, are heard."""
     from mavsitl import ends
     from mavsitl.link.address import Address
@@ -1170,7 +1208,7 @@ def _ground_fleet(options: argparse.Namespace, flight: Flight, first: Address, s
     )
     outcome = ends.ground_fleet(
         flight, addresses, options.run_dir, count=count, first_system_id=system_id, wing=options.wing,
-        report=status.say, stop=status.stop,
+        report=status.say, stop=status.stop, wish=wish,
     )  # fmt: skip
     status.end_fleet(outcome)
     return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED

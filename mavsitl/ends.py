@@ -14,7 +14,7 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mavsitl import __version__, drivers, fleet, wings
+from mavsitl import __version__, drivers, fleet, process, realtime, wings
 from mavsitl.clock import monotonic_us, unix_us
 from mavsitl.drivers import Progress, RealTime, Tap
 from mavsitl.fleet import FleetOutcome, Flown
@@ -332,10 +332,11 @@ def vehicle_lockstep(
             watch = _Watch(core)
             channels = _channels(flight)
             _watch_lockstep_link(core, channels, recorder, tap)
-            end_us = drivers.run_lockstep_vehicle(
-                core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
-                channels=channels, max_time_s=flight.scenario.duration_s + IMPAIRED_GRACE_S,
-            )  # fmt: skip
+            with process.flying():
+                end_us = drivers.run_lockstep_vehicle(
+                    core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
+                    channels=channels, max_time_s=flight.scenario.duration_s + IMPAIRED_GRACE_S,
+                )  # fmt: skip
             return watch.outcome(end_us, tap, links=_statistics(channels))
     finally:
         link.close()
@@ -359,10 +360,11 @@ def ground_lockstep(
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
-            end_us = drivers.run_lockstep_ground(
-                core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
-                impaired=flight.scenario.impaired,
-            )  # fmt: skip
+            with process.flying():
+                end_us = drivers.run_lockstep_ground(
+                    core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
+                    impaired=flight.scenario.impaired,
+                )  # fmt: skip
             return watch.outcome(end_us, tap)
     finally:
         link.close()
@@ -372,12 +374,16 @@ def vehicle_realtime(
     flight: Flight, links: VehicleLinks, folder: Path | None, *,
     system_id: int, wing: str | None, speed: float, until_finished: bool, state: Path | None,
     report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
+    wish: realtime.Wish = realtime.Wish.ORDINARY,
 ) -> Outcome:  # fmt: skip
-    """The vehicle on the wall clock, with PX4 SITL's two links and TCP where asked for. Raises as `vehicle_lockstep`.
+    """The vehicle on the wall clock, with PX4 SITL's two links and TCP where asked for.
 
     `state` is the folder of what outlives the process, None: nothing does. `report` is told what went wrong on the
-    machine, and so are the links: logs that cannot be written any more, real time that was not kept.
+    machine, and so are the links: logs that cannot be written any more, real time that was not kept. `wish`: of the
+    system, see `mavsitl.realtime`.
+    Raises as `vehicle_lockstep`, and `RealTimeError`.
     """
+    realtime.check(wish)
     opened: list[Link] = []
     core: Any = None
 
@@ -430,10 +436,12 @@ def vehicle_realtime(
             except ExposedError:
                 core.close()
                 raise
-            timing = drivers.run_realtime_vehicle(
-                core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, say=report,
-                progress=progress, due_s=live.due_s,
-            )  # fmt: skip
+            with process.flying(), realtime.claim(wish, report):
+                realtime.fine_timers()
+                timing = drivers.run_realtime_vehicle(
+                    core, opened, tap, speed=speed, until_finished=until_finished, stop=stop, say=report,
+                    progress=progress, due_s=live.due_s,
+                )  # fmt: skip
             return watch.outcome(timing.simulated_us, tap, timing, links=live.statistics())
     finally:
         for link in opened:
@@ -448,17 +456,20 @@ def ground_realtime(
     flight: Flight, address: Address, folder: Path | None, *,
     vehicle_system_id: int | None, wing: str | None,
     report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
+    wish: realtime.Wish = realtime.Wish.ORDINARY,
 ) -> Outcome:  # fmt: skip
-    """The ground on the wall clock, on any endpoint. Raises as `vehicle_lockstep`."""
+    """The ground on the wall clock, on any endpoint. Raises as `vehicle_realtime`."""
+    realtime.check(wish)
     link = open_link(address, port_option="--link udpin:HOST:PORT", host_option="--link udpin:HOST:PORT")
     try:
         with _logs(folder, "ground", flight, lambda error: report(f"logging has ended: {error}")) as (recorder, tap):
             build = wings.find(wings.GROUND_GROUP, wing)
             core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
             watch = _Watch(core)
-            simulated_us, wall_us = drivers.run_realtime_ground(
-                core, link, tap, stop=stop, say=report, progress=progress
-            )
+            with process.flying(), realtime.claim(wish, report):
+                simulated_us, wall_us = drivers.run_realtime_ground(
+                    core, link, tap, stop=stop, say=report, progress=progress
+                )
             return watch.outcome(simulated_us, tap, wall_us=wall_us)
     finally:
         link.close()
@@ -531,6 +542,7 @@ def fleet_realtime(
     flight: Flight, links: Sequence[VehicleLinks], folder: Path | None, *,
     count: int, system_id: int, wing: str | None, speed: float, until_finished: bool, states: Sequence[Path | None],
     report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
+    wish: realtime.Wish = realtime.Wish.ORDINARY,
 ) -> FleetOutcome:  # fmt: skip
     """`count` vehicles on the wall clock in this process. `links`: each one's, or those that all are behind.
 
@@ -538,6 +550,8 @@ def fleet_realtime(
     are what each keeps. Raises as `vehicle_realtime`.
     """
     from mavsitl import seeds  # here, for it loads numpy
+
+    realtime.check(wish)
 
     one_link = len(links) < count
     for each in links:
@@ -579,11 +593,13 @@ def fleet_realtime(
                 logs[j][1].record = LinkLog(logs[j][0], _channels_of(live)).write
         taps = {} if folder is None else {j * per_group: logs[j][1] for j in range(len(opened))}
         started_us = monotonic_us()
-        timing = fleet.run_realtime_fleet(
-            core, ports, taps, logs=[] if folder is None else [tap for _, tap in logs],
-            polled=lambda: ports.polled(lives), speed=speed, until_finished=until_finished,
-            stop=stop, say=report, progress=progress,
-        )  # fmt: skip
+        with process.flying(), realtime.claim(wish, report):
+            realtime.fine_timers()
+            timing = fleet.run_realtime_fleet(
+                core, ports, taps, logs=[] if folder is None else [tap for _, tap in logs],
+                polled=lambda: ports.polled(lives), speed=speed, until_finished=until_finished,
+                stop=stop, say=report, progress=progress,
+            )  # fmt: skip
         flown = tuple(
             Flown(
                 vehicle.system_id, vehicle.succeeded,
@@ -647,9 +663,10 @@ def _check_exposed_fleet(links: VehicleLinks, report: Callable[[str], None]) -> 
 def ground_fleet(
     flight: Flight, addresses: Sequence[Address], folder: Path | None, *,
     count: int, first_system_id: int, wing: str | None,
-    report: Callable[[str], None], stop: Callable[[], bool],
+    report: Callable[[str], None], stop: Callable[[], bool], wish: realtime.Wish = realtime.Wish.ORDINARY,
 ) -> FleetOutcome:  # fmt: skip
     """`count` controllers on the wall clock, each on its endpoint or all on one. Raises as `ground_realtime`."""
+    realtime.check(wish)
     opened: list[Link] = []
     with ExitStack() as stack:
         stack.callback(_close_all, opened)
@@ -667,7 +684,8 @@ def ground_fleet(
             report=report, vehicle_system_id=first_system_id, one_link=len(addresses) < count,
         )  # fmt: skip
         taps = {} if folder is None else {j: tap for j, (_, tap) in enumerate(logs)}
-        simulated_us, wall_us = fleet.run_realtime_formation(core, opened, taps, stop=stop, say=report)
+        with process.flying(), realtime.claim(wish, report):
+            simulated_us, wall_us = fleet.run_realtime_formation(core, opened, taps, stop=stop, say=report)
         return _fleet_outcome(core, simulated_us, wall_us, core.flown())
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from mavsitl.drivers import fly_in_memory
 from mavsitl.log.flight import FlightData
 from mavsitl.log.ulog import MemoryRecorder
 from mavsitl.report.metrics import PAPER_TABLES, maximum_error, rmse
-from tests.bench import bench_lockstep
 from tests.experiments import engine, failures, learning, limits, links, results, stability
 from tests.experiments.engine import Job, Outcome
 from tests.experiments.sums import first_weights
@@ -199,10 +198,6 @@ def test_limits_changes_one_thing_at_a_time(capsys: pytest.CaptureFixture[str]) 
     assert limits.main(["--quick", "--jobs", "1"]) == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     assert len(rows) == len(limits.cases()) + 3
-
-
-def test_the_rival_of_the_benchmark_hovers() -> None:
-    assert isfinite(bench_lockstep.fly_rival(0.5))
 
 
 def test_a_link_does_not_change_what_is_measured() -> None:
