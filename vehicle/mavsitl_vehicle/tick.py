@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mavsitl.compiled import compiled
 from mavsitl.control.allocation import allocate
 from mavsitl_vehicle.autopilot.attitude import attitude_error, quaternion_product
+from mavsitl_vehicle.plant.lanes import scratch
 from mavsitl_vehicle.plant.step import rk4_step
 from mavsitl_vehicle.sensors import imu
 from mavsitl_vehicle.wind.field import wind_step
@@ -228,6 +229,7 @@ def advance(
     """
     outer_loop(demand, estimate, gains, inner)
     gyro = np.empty((3, x.shape[1]))
+    block = scratch(x.shape[1])
     per_step = wind_normals.shape[0] // substeps
     for k in range(substeps):
         normals = wind_normals[k * per_step : (k + 1) * per_step]
@@ -237,7 +239,7 @@ def advance(
                 gyro[i, j] = x[10 + i, j] + gains[GYRO_SIGMA] * sensor_normals[k * GYRO_NORMALS + i, j]
         inner_loops(gyro, demand, gains, inner, held, dt_s, command)
         fail_motors(x, demand, motors, command)
-        rk4_step(x, command, wind, plant, dt_s, held)
+        rk4_step(x, command, wind, plant, dt_s, held, block)
     measure(x, sigma, sensor_normals[substeps * GYRO_NORMALS :], estimate)
 
 
@@ -275,6 +277,7 @@ def advance_sensed(
     n = x.shape[1]
     gyro = np.empty((3, n))
     before = np.empty((7, n))
+    block = scratch(n)
     per_step = wind_normals.shape[0] // substeps
     imu.begin(imu_state, imu_settings, imu_normals[substeps * imu.NORMALS :])
     for k in range(substeps):
@@ -286,7 +289,7 @@ def advance_sensed(
         for j in range(n):
             for i in range(7):
                 before[i, j] = x[3 + i, j]
-        rk4_step(x, command, wind, plant, dt_s, held)
+        rk4_step(x, command, wind, plant, dt_s, held, block)
         imu.sample(
             imu_state, imu_late, imu_settings, imu_added, gyro_kind, accel_kind, before, x,
             imu_normals[k * imu.NORMALS : (k + 1) * imu.NORMALS], dt_s,
