@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mavsitl.compiled import compiled
 from mavsitl.control.allocation import allocate
 from mavsitl_vehicle.autopilot.attitude import attitude_error, quaternion_product
+from mavsitl_vehicle.plant.lanes import scratch
 from mavsitl_vehicle.plant.parameters import N_PARAMETERS
 from mavsitl_vehicle.plant.step import rk4_step
 from mavsitl_vehicle.sensors import imu
@@ -271,6 +272,7 @@ def advance(
     outer_loop(demand, estimate, gains, inner)
     gyro = np.empty((3, n))
     now_s = np.empty(n)
+    block = scratch(n)
     winds, noise = wind_normals[tick % wind_normals.shape[0]], sensor_normals[tick % sensor_normals.shape[0]]
     per_step = winds.shape[0] // substeps
     for k in range(substeps):
@@ -282,7 +284,7 @@ def advance(
                 gyro[i, j] = x[10 + i, j] + gains[GYRO_SIGMA, j] * noise[k * GYRO_NORMALS + i, j]
         inner_loops(gyro, demand, gains, inner, held, dt_s, command)
         fail_motors(x, demand, motors, command)
-        rk4_step(x, command, wind, plant, dt_s, held)
+        rk4_step(x, command, wind, plant, dt_s, held, block)
     measure(x, sigma, noise[substeps * GYRO_NORMALS :], estimate)
     write_log(rows, asked, log[(tick + 1) % log.shape[0]])
 
@@ -323,6 +325,7 @@ def advance_sensed(
     gyro = np.empty((3, n))
     now_s = np.empty(n)
     before = np.empty((7, n))
+    block = scratch(n)
     winds, noise = wind_normals[tick % wind_normals.shape[0]], imu_normals[tick % imu_normals.shape[0]]
     per_step = winds.shape[0] // substeps
     imu.begin(imu_state, imu_settings, noise[substeps * imu.NORMALS :])
@@ -336,7 +339,7 @@ def advance_sensed(
         for j in range(n):
             for i in range(7):
                 before[i, j] = x[3 + i, j]
-        rk4_step(x, command, wind, plant, dt_s, held)
+        rk4_step(x, command, wind, plant, dt_s, held, block)
         imu.sample(
             imu_state, imu_late, imu_settings, imu_added, gyro_kind, accel_kind, before, x,
             noise[k * imu.NORMALS : (k + 1) * imu.NORMALS], dt_s,
