@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 
 import msgspec
 
+from mavsitl.campaign.errors import GridError
 from mavsitl.scenario import Flight, ScenarioError, Waypoints, load
 
 Overrides: TypeAlias = dict[str, Any]
@@ -79,10 +80,6 @@ def source_digest() -> str:
                 if inside.startswith(DECIDING) or not inside.startswith(NOT_FLYING):
                     digest.update(inside.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
-
-
-class GridError(ValueError):
-    """What is to be swept is not understood; the message names it and what is allowed."""
 
 
 class Setting(msgspec.Struct, frozen=True):

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavsitl.campaign.grid import Grid, GridError, parse_seeds, parse_setting, split
+from mavsitl.campaign.errors import GridError
+from mavsitl.campaign.grid import Grid, parse_seeds, parse_setting, split
 from mavsitl.scenario import ScenarioError
 
 
