@@ -1325,14 +1325,21 @@ def _sweep(options: argparse.Namespace) -> int:
             with crew:
                 _fly_missing(plan, journal, crew, known.flown, folder)
         rows = sweep.rows(plan, journal)
-    command = "mavsitl " + shlex.join(sys.argv[1:])
-    results = sweep.save(plan, rows, folder, command, utc_stamp())
+    facts = sweep.metadata(plan, "mavsitl " + shlex.join(sys.argv[1:]), utc_stamp())
+    results = sweep.save(plan, rows, folder, facts)
     summary = sweep.summary(plan, rows)
+    page = None
+    if not options.no_report:
+        from mavsitl.report import sweep as report
+
+        page = report.write(folder, rows, summary, plan.grid.keys, facts)
     if options.json:
         _print_sweep_json(results, rows, summary)
     else:
-        _show_sweep(console, rows, summary)
-    console.print(f"results: {results}", soft_wrap=True, markup=False)
+        _show_sweep(console, summary)
+    for what, path in (("results", results), ("report", page)):
+        if path is not None:
+            console.print(f"{what + ':':8s} {path}", soft_wrap=True, markup=False)
     failed = [row for row in rows if row.status == "failed"]
     if failed:
         said = sorted({row.message for row in failed})
@@ -1399,22 +1406,21 @@ def _print_sweep_json(results: Path, rows: Sequence[Row], summary: Summary) -> N
     print(msgspec.json.format(msgspec.json.encode(shown), indent=2).decode())
 
 
-def _show_sweep(console: Console, rows: Sequence[Row], summary: Summary) -> None:
+def _show_sweep(console: Console, summary: Summary) -> None:
+    from rich import box
     from rich.table import Table
 
     from mavsitl.report import sweep_tables
 
-    table = Table(title="medians and their 95 % intervals", title_justify="left", title_style="")
-    for column in sweep_tables.cell_header(summary):
-        table.add_column(column, justify="right")
-    for cells in sweep_tables.cell_rows(summary):
-        table.add_row(*cells)
-    console.print(table)
+    shown = [("medians, 95 % intervals", sweep_tables.cell_header(summary), sweep_tables.cell_rows(summary))]
     if summary.comparisons:
-        table = Table(title="seed by seed: median difference", title_justify="left", title_style="")
-        for column in sweep_tables.comparison_header():
-            table.add_column(column, justify="right")
-        for cells in sweep_tables.comparison_rows(summary):
+        header, rows = list(sweep_tables.COMPARISON_HEADER), sweep_tables.comparison_rows(summary)
+        shown.append(("seed by seed: median difference and ratio, Wilcoxon's p", header, rows))
+    for title, header, rows in shown:
+        table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+        for column in header:
+            table.add_column(column, justify="left" if column in ("", "measure") else "right")
+        for cells in rows:
             table.add_row(*cells)
         console.print(table)
 
