@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite, nan
+from math import ceil, isfinite, nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +17,8 @@ from mavsitl.report.sweep_tables import COMPARED, described, short, shown, versu
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ROW_IN = 0.3
+ROW_IN, LINE_IN = 0.3, 0.24
+"""Of a row of a figure, and of a line of a legend."""
 MOST_ROWS = 60
 """Cells and comparisons drawn; a page is not a book."""
 MOST_LINES = 6
@@ -47,7 +48,7 @@ def distribution(rows: Sequence[Row], summary: Summary, keys: Sequence[str], nam
                       markeredgewidth=0.0, zorder=2)  # fmt: skip
             _mark(axes, spread.median, place, colour)
             if gone := cell.lost + cell.failed:
-                axes.annotate(f"{gone} not flown", (1.0, place), xycoords=("axes fraction", "data"), color=BROKEN,
+                axes.annotate(f"{gone} not flown to the end", (1.0, place), xycoords=("axes fraction", "data"), color=BROKEN,
                               ha="right", va="center", fontsize=8.0)  # fmt: skip
         _scale(axes, [value for each in values for value in each], "x")
         axes.set_xlabel(measure.title)
@@ -67,9 +68,12 @@ def against(summary: Summary, key: str, name: str) -> Drawing | None:
     if not numeric or len(places) < 3 or len(curves) > MOST_LINES:
         return None
     measure = MEASURES[name]
+    lines = ceil(len(curves) / 2) if len(curves) > 1 else 0
+    height_in = 3.2 + LINE_IN * lines
 
     def draw(figure: Figure) -> None:
-        axes = figure.add_axes((0.1, 0.16, 0.87, 0.7 if len(curves) > 1 else 0.79))
+        bottom, top = 0.52 / height_in, 1.0 - (0.15 + LINE_IN * lines) / height_in
+        axes = figure.add_axes((0.1, bottom, 0.87, top - bottom))
         seen: list[float] = []
         for (label, cells), colour in zip(curves.items(), COLOURS, strict=False):
             ordered = sorted(cells, key=lambda cell: float(cell.labels[key]))
@@ -85,11 +89,11 @@ def against(summary: Summary, key: str, name: str) -> Drawing | None:
         _scale(axes, seen, "y")
         axes.set_xlabel(key)
         axes.set_ylabel(measure.title)
-        if len(curves) > 1:
-            figure.legend(*axes.get_legend_handles_labels(), loc="upper right", ncols=min(len(curves), 3))
+        if lines:
+            figure.legend(*axes.get_legend_handles_labels(), loc="upper right", ncols=2, fontsize=8.5)
 
     caption = f"{measure.headline} against {key}: medians and their 95 % intervals"
-    return Drawing(svg(draw, 3.4, f"against-{name}"), caption, "")
+    return Drawing(svg(draw, height_in, f"against-{name}"), caption, "")
 
 
 def differences(rows: Sequence[Row], summary: Summary, name: str) -> Drawing | None:
