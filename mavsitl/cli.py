@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
+import shlex
 import signal
 import sys
 import tomllib
@@ -19,6 +21,11 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
     from mavsitl.ask import Reply, Task
+    from mavsitl.campaign.fly import Row
+    from mavsitl.campaign.store import Journal
+    from mavsitl.campaign.summary import Summary
+    from mavsitl.campaign.sweep import Known, Plan
+    from mavsitl.campaign.workers import Workers
     from mavsitl.check import Heard, PortReport, Report
     from mavsitl.ends import Outcome, VehicleLinks
     from mavsitl.fleet import FleetOutcome
@@ -50,6 +57,7 @@ A quadrotor in Dryden wind and an off-board controller, two processes that meet 
   mavsitl link         make the links of a flying vehicle bad, and good again
   mavsitl inject       break a part of a flying vehicle
   mavsitl param        read and set parameters
+  mavsitl sweep        fly a grid of settings and seeds, and compare
 """
 
 EPILOG = """\
@@ -194,6 +202,34 @@ examples:
   mavsitl param list "SIM_*"
 """
 
+SWEEP_HELP = """\
+Fly every combination of the settings with every seed: whole flights in memory, on all cores of this machine or on a
+Dask cluster. Each flight is a row: flown, lost (too far from its reference), or failed, with what went wrong.
+
+The folder gets rows.jsonl, row by row, then results.parquet and report.html. A sweep that was interrupted or killed
+goes on with the same command. A flight is known by its scenario, airframe, seed and the code that flies: where one of
+these has changed it is flown again, else it is not.
+
+  --set KEY=A,B,C            these values; an array or table of TOML is one value
+  --set KEY=START:STOP:STEP  a range, STOP included: 0:10:5 is 0, 5, 10
+  --set KEY=A                this value in every flight
+  --seeds N                  seeds 1 to N; also N,N,N and FIRST-LAST
+
+A key with two values is compared seed by seed: the same seed is the same air and the same noise.
+"""
+
+SWEEP_EXAMPLES = """\
+examples:
+  mavsitl sweep hover-wind --set wind.speed_20ft_m_s=0,5,10 --seeds 50
+  mavsitl sweep hover-wind --set controller.law=pid,pidnn --seeds 50 --jobs 4
+  mavsitl sweep spiral-wind --set offnominal.mass_scale=0.8:1.4:0.1 --compare controller.law=pid,pidnn
+  mavsitl sweep my.toml --compare controller.learning.rate=[0,0,0],[1,1,1],[10,10,10] --seeds 20
+  mavsitl sweep hover-wind --seeds 1000 --scheduler tcp://192.0.2.7:8786
+
+Exit codes: 0 every flight has its row, lost ones too; 1 some failed by an error, or the sweep did; 2 wrong arguments;
+130 interrupted.
+"""
+
 ASK_EPILOG = """
 Exit codes: 0 done; 1 refused, or no answer (the message says by whom and what to do); 2 wrong arguments.
 """
@@ -266,6 +302,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _exit_code(error: Exception) -> int | None:
     """Of an error whose text is for the user; None for any other. They are loaded here: most runs have none."""
+    from mavsitl.campaign.errors import CampaignError, GridError
     from mavsitl.chaos.table import ChaosError
     from mavsitl.ends import ExposedError
     from mavsitl.link.address import AddressError
@@ -277,9 +314,10 @@ def _exit_code(error: Exception) -> int | None:
     from mavsitl.scenario import ScenarioError
     from mavsitl.wings import WingError
 
-    if isinstance(error, (UsageError, ExposedError, ScenarioError, ChaosError, AddressError, WingError)):
+    if isinstance(error, (UsageError, ExposedError, ScenarioError, GridError, ChaosError, AddressError, WingError)):
         return EXIT_USAGE
-    return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RealTimeError, RunError)) else None
+    failed = (LinkError, LogError, PairError, RealTimeError, RunError, CampaignError)
+    return EXIT_FAILED if isinstance(error, failed) else None
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -294,6 +332,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_link(commands)
     _add_inject(commands)
     _add_param(commands)
+    _add_sweep(commands)
     _add_report(commands)
     _add_scenarios(commands)
     _add_chaos(commands)
@@ -593,6 +632,44 @@ def _add_param(commands: Any) -> None:
     parser.add_argument("names", nargs="*", metavar="NAME[=VALUE]", help="with list a pattern such as 'SIM_*'")
     _add_ask_options(parser, "udpout:127.0.0.1:18570 + I")
     parser.set_defaults(run=_param)
+
+
+def _add_sweep(commands: Any) -> None:
+    parser = _command(commands, "sweep", "fly a grid of settings and seeds, and compare", SWEEP_HELP, SWEEP_EXAMPLES)
+    parser.add_argument("scenario", metavar="SCENARIO", help="a shipped scenario's name or a .toml file")
+    group = parser.add_argument_group("grid")
+    group.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUES", dest="settings",
+        help="any key of the scenario, dotted, with its values; may be repeated",
+    )  # fmt: skip
+    group.add_argument(
+        "--compare", action="append", default=[], metavar="KEY=VALUES",
+        help="as --set, and each further value is compared with the first, seed by seed; may be repeated",
+    )  # fmt: skip
+    group.add_argument("--seeds", default="10", metavar="SEEDS", help="default: 10, which is 1 to 10")
+    group = parser.add_argument_group("run")
+    group.add_argument("--jobs", type=_whole(1, 4096), metavar="N", help="processes (default: one for each core)")
+    group.add_argument(
+        "--scheduler",
+        type=_scheduler,
+        metavar="ADDRESS",
+        help="of a Dask cluster, tcp://HOST:PORT, in place of processes",
+    )
+    group.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder (default: runs/sweep-SCENARIO); what is there is gone on with",
+    )
+    group.add_argument("--no-report", action="store_true", help="results and tables only")
+    group.add_argument("--json", action="store_true", help="print the summary as JSON and nothing else")
+    parser.set_defaults(run=_sweep)
+
+
+def _scheduler(text: str) -> str:
+    if not re.fullmatch(r"(tcp|tls|ucx|wss?)://\S+:\d+", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: tcp://HOST:PORT or tls://HOST:PORT")
+    return text
 
 
 def _add_ask_options(parser: argparse.ArgumentParser, default: str) -> None:
@@ -1462,6 +1539,134 @@ def _wish(text: str, to_set: bool) -> tuple[str, float | None]:
     except ValueError:
         raise UsageError(f"{text}: {value!r} is not a number") from None
     return name, number
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from mavsitl.campaign import optional, sweep, workers
+    from mavsitl.campaign.store import Journal
+    from mavsitl.clock import utc_stamp
+
+    _on_signals(_interrupt)
+    if options.jobs is not None and options.scheduler is not None:
+        raise UsageError("--jobs: not with --scheduler, whose workers are what they are")
+    plan = sweep.plan(options.scenario, options.settings, options.compare, options.seeds)
+    optional.need("pyarrow")  # before anything flies
+    name = plan.cases[0].flight.name
+    folder: Path = options.output or Path("runs") / f"sweep-{name}"
+    console = Console(stderr=options.json, highlight=False)
+    console.print(f"[bold]{name}[/]  {plan}", soft_wrap=True)
+    with Journal(folder / sweep.JOURNAL_FILE) as journal:
+        known = sweep.known(plan, journal)
+        for text in _told(known, len(plan.cases), folder):
+            console.print(text, soft_wrap=True, markup=False)
+        missing = len(plan.cases) - known.flown
+        if missing:
+            crew = workers.Dask(options.scheduler) if options.scheduler else workers.local(
+                min(options.jobs or workers.cores(), missing)
+            )  # fmt: skip
+            with crew:
+                _fly_missing(plan, journal, crew, known.flown, folder)
+        rows = sweep.rows(plan, journal)
+    facts = sweep.metadata(plan, "mavsitl " + shlex.join(sys.argv[1:]), utc_stamp())
+    results = sweep.save(plan, rows, folder, facts)
+    summary = sweep.summary(plan, rows)
+    page = None
+    if not options.no_report:
+        from mavsitl.report import sweep as report
+
+        page = report.write(folder, rows, summary, plan.grid.keys, facts)
+    if options.json:
+        _print_sweep_json(results, rows, summary)
+    else:
+        _show_sweep(console, summary)
+    for what, path in (("results", results), ("report", page)):
+        if path is not None:
+            console.print(f"{what + ':':8s} {path}", soft_wrap=True, markup=False)
+    failed = [row for row in rows if row.status == "failed"]
+    if failed:
+        said = sorted({row.message for row in failed})
+        console.print(f"{len(failed)} of {len(rows)} failed: {said[0]}", soft_wrap=True, markup=False, style="bold red")
+    return EXIT_FAILED if failed else EXIT_OK
+
+
+def _told(known: Known, total: int, folder: Path) -> list[str]:
+    """What of a sweep need not be flown again, and what has to, and why."""
+    told = []
+    if known.flown:
+        told.append(f"{known.flown} of {total} were flown before ({folder})")
+    if known.other_code:
+        told.append(f"{known.other_code} of {total} were flown before by other code, and are flown again")
+    if known.other_scenario:
+        told.append(
+            f"{known.other_scenario} of {total} were flown before with other settings or another scenario file, "
+            "and are flown again"
+        )
+    return told
+
+
+def _fly_missing(plan: Plan, journal: Journal, crew: Workers, before: int, folder: Path) -> None:
+    """With a progress bar on stderr."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from mavsitl.campaign import sweep
+
+    console = Console(stderr=True, highlight=False)
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    total, done = len(plan.cases), before
+    counts = {"lost": 0, "failed": 0}
+    with Progress(*columns, TextColumn("{task.fields[said]}"), console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("flights", total=total, completed=before, said="")
+        try:
+            for row in sweep.fly(plan, journal, crew):
+                done += 1
+                if not row.flown:
+                    counts[row.status] += 1
+                said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+                bar.update(task, advance=1, said=said)
+        except BaseException:
+            bar.stop()
+            console.print(
+                f"{done} of {total} are in {folder}; the same command goes on with the rest",
+                soft_wrap=True, markup=False,
+            )  # fmt: skip
+            raise
+
+
+def _print_sweep_json(results: Path, rows: Sequence[Row], summary: Summary) -> None:
+    import msgspec
+
+    counts = {status: sum(row.status == status for row in rows) for status in ("flown", "lost", "failed")}
+    shown = {"results": str(results), "flights": len(rows), **counts, **msgspec.to_builtins(summary)}
+    print(msgspec.json.format(msgspec.json.encode(shown), indent=2).decode())
+
+
+def _show_sweep(console: Console, summary: Summary) -> None:
+    from rich import box
+    from rich.table import Table
+
+    from mavsitl.report import sweep_tables
+
+    shown = [("medians, 95 % intervals", sweep_tables.cell_header(summary), sweep_tables.cell_rows(summary))]
+    if summary.comparisons:
+        header, rows = list(sweep_tables.COMPARISON_HEADER), sweep_tables.comparison_rows(summary)
+        shown.append(("seed by seed: median difference and ratio, Wilcoxon's p", header, rows))
+    for title, header, rows in shown:
+        table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+        for column in header:
+            table.add_column(column, justify="left" if column in ("", "measure") else "right")
+        for cells in rows:
+            table.add_row(*cells)
+        console.print(table)
 
 
 def _report(options: argparse.Namespace) -> int:
