@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mavsitl.ends import Outcome
     from mavsitl.report.run import FlightRecord
     from mavsitl.scenario import Flight
+    from mavsitl.tune.run import Tuning
 
 PAPER_SCENARIOS = ("hover-calm", "hover-wind", "spiral-calm", "spiral-wind")
 
@@ -39,6 +40,7 @@ DESCRIPTION = """\
 A quadrotor in Dryden wind and an off-board controller, two processes that meet on MAVLink 2 over UDP alone.
 
   mavsitl fly          fly the paper's four experiments and write a report
+  mavsitl tune         search a controller's gains, and judge them on other seeds
   mavsitl vehicle      a vehicle alone, in real time, on PX4 SITL's ports
   mavsitl ground       the paper's controller alone, for that vehicle or any PX4-like one
   mavsitl check        who is on the ports, and does it answer: when nothing arrives
@@ -70,6 +72,33 @@ examples:
   mavsitl fly my.toml --seed 7 --level attitude      a file of your own
   mavsitl fly hover-wind --set noise.position_m=0.02 --set offnominal.mass_scale=1.3
   mavsitl fly --in-memory                            one process, no sockets, the same bytes
+"""
+
+TUNE_HELP = """\
+Search the gains and learning rates of a controller over whole flights in memory. Each candidate flies every scenario
+under the same few seeds; what is found is then judged against the start on seeds that the search has not seen. Without
+a scenario the paper's four experiments are flown together.
+
+  error      mean over scenarios, states and seeds of RMSE over the paper's number in Tables 3 and 4; in a scenario that
+             is none of the paper's over 0.1 m and 0.5 degrees
+  effort     RMS of the rotors' speeds about their mean, rad/s
+  searched   the least error x effort^W, W being --effort-weight; a lost flight is worse than any that was flown
+
+The search starts at the gains that the scenarios have, and is SciPy's COBYQA. --tune KEY=LOW:HIGH names what is turned
+and how far, with :log or :linear behind it for how the range is divided; without a range it is a fifth of the value to
+five times that; without --tune it is every gain, filter, learning rate and observer bandwidth that the controller
+reads. An array such as controller.learning.rate is turned as one, or item by item: controller.learning.rate[0].
+
+The run folder gets each scenario with the gains found, tune.json with every candidate, tune.html, one self-contained
+page, and flights.jsonl, every flight so far: the same command with the same --run-dir goes on where it was ended.
+"""
+
+TUNE_EXAMPLES = """\
+examples:
+  mavsitl tune                                       the paper's controller on the paper's four experiments
+  mavsitl tune hover-wind-realistic --jobs 8 --evaluations 300
+  mavsitl tune my.toml --tune controller.position.k_p_per_s2=1:20 --tune controller.learning.rate=1:100:log
+  mavsitl tune hover-wind --search-duration 20 --effort-weight 0.5 --run-dir runs/gentle
 """
 
 VEHICLE_HELP = """\
@@ -277,6 +306,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"mavsitl {__version__}")
     commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
     _add_fly(commands)
+    _add_tune(commands)
     _add_vehicle(commands)
     _add_ground(commands)
     _add_check(commands)
@@ -338,9 +368,11 @@ _PORT = _whole(0, 65535)
 _SYSTEM = _whole(1, 255)
 
 
-def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
+def _add_scenario_options(parser: argparse.ArgumentParser, *, seed: bool = True) -> None:
+    """`seed`: False for a command that flies many seeds."""
     group = parser.add_argument_group("scenario")
-    group.add_argument("--seed", type=int, metavar="N", help="seed of wind and noise (scenario key: seed)")
+    if seed:
+        group.add_argument("--seed", type=int, metavar="N", help="seed of wind and noise (scenario key: seed)")
     group.add_argument("--airframe", metavar="NAME", help="paper, realistic, full-coupling or a .toml file (airframe)")
     group.add_argument("--law", choices=("pidnn", "pid"), help="attitude law (controller.law)")
     group.add_argument("--level", choices=("attitude", "body_rate", "torque"), help="command level (controller.level)")
@@ -376,6 +408,46 @@ def _add_fly(commands: Any) -> None:
     group.add_argument("--no-report", action="store_true", help="logs and tables only")
     group.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
     parser.set_defaults(run=_fly)
+
+
+def _add_tune(commands: Any) -> None:
+    parser = _command(
+        commands, "tune", "search a controller's gains, and judge them on other seeds", TUNE_HELP, TUNE_EXAMPLES
+    )
+    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="a shipped scenario's name or a .toml file")
+    _add_scenario_options(parser, seed=False)
+    group = parser.add_argument_group("search")
+    group.add_argument(
+        "--tune", action="append", default=[], metavar="KEY[=LOW:HIGH]", dest="keys",
+        help="a key of controller or parameters, and its range; may be repeated",
+    )  # fmt: skip
+    group.add_argument(
+        "--evaluations", type=_whole(1, 1_000_000), default=150, metavar="N", help="candidates (default: 150)"
+    )
+    group.add_argument(
+        "--effort-weight", type=_not_negative, default=0.1, metavar="W",
+        help="what 1 %% of effort has to buy, in %% of error (default: 0.1)",
+    )  # fmt: skip
+    group.add_argument(
+        "--seeds", type=_whole(1, 1000), default=3, metavar="N", help="flown by each candidate: 1001, ... (default: 3)"
+    )
+    group.add_argument(
+        "--held-out", type=_whole(1, 1000), default=20, metavar="N", help="judged on: 1, 2, ... (default: 20)"
+    )
+    group.add_argument(
+        "--search-duration", type=_above_zero, metavar="S",
+        help="fly so much of each flight in the search; judged is the whole (default: all of it)",
+    )  # fmt: skip
+    group.add_argument(
+        "--search-seed", type=_whole(0, 2**31), default=1, metavar="N", help="of the search itself (default: 1)"
+    )
+    group = parser.add_argument_group("run")
+    group.add_argument(
+        "--jobs", type=_whole(1, 1024), metavar="N", help="processes; 1 is this one alone (default: one a core)"
+    )
+    group.add_argument("--run-dir", type=Path, metavar="DIR", help="run folder (default: runs/tune-<UTC time>)")
+    group.add_argument("--json", action="store_true", help="print tune.json and nothing else")
+    parser.set_defaults(run=_tune)
 
 
 def _add_vehicle(commands: Any) -> None:
@@ -597,7 +669,7 @@ def _settings(options: argparse.Namespace) -> list[str]:
     """All scenario options as KEY=VALUE, the form in which they are handed on to the processes."""
     settings = list(options.settings)
     named = {
-        "seed": options.seed, "airframe": options.airframe,
+        "seed": getattr(options, "seed", None), "airframe": options.airframe,
         "controller.law": options.law, "controller.level": options.level,
         "controller.wind_information": options.wind_information, "duration_s": options.duration,
     }  # fmt: skip
@@ -610,6 +682,13 @@ def _settings(options: argparse.Namespace) -> list[str]:
 def _load(name: str, settings: Sequence[str]) -> Flight:
     from mavsitl import scenario
 
+    return scenario.load(name, _overrides(settings))
+
+
+def _overrides(settings: Sequence[str]) -> dict[str, Any]:
+    """What --set and the named options change. Raises `ScenarioError`."""
+    from mavsitl import scenario
+
     overrides: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
@@ -619,7 +698,7 @@ def _load(name: str, settings: Sequence[str]) -> Flight:
             overrides[key.strip()] = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             overrides[key.strip()] = text
-    return scenario.load(name, overrides)
+    return overrides
 
 
 def _endpoint(text: str, option: str) -> tuple[str, int]:
@@ -750,6 +829,102 @@ def _show(console: Any, options: argparse.Namespace, folder: Path, records: list
             f"[bold red]{record.name} was lost after {end_s:.1f} s:[/] {record.lost}", soft_wrap=True, highlight=False
         )
     return EXIT_FAILED if lost else EXIT_OK
+
+
+def _tune(options: argparse.Namespace) -> int:
+    import shlex
+
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from mavsitl.campaign import workers
+    from mavsitl.campaign.store import Journal
+    from mavsitl.clock import utc_stamp
+    from mavsitl.tune import flights, run
+
+    _on_signals(_interrupt)
+    plan = run.Plan(
+        names=tuple(options.scenarios or PAPER_SCENARIOS), settings=_overrides(_settings(options)),
+        asked=tuple(options.keys), evaluations=options.evaluations, effort_weight=options.effort_weight,
+        seeds=options.seeds, held_out=options.held_out, search_duration_s=options.search_duration,
+        seed=options.search_seed,
+    )  # fmt: skip
+    tuning = run.begin(plan)
+    created = utc_stamp()
+    folder: Path = options.run_dir or Path("runs") / ("tune-" + created.replace(":", "").replace("-", ""))
+    command = shlex.join(["mavsitl", *sys.argv[1:]])
+    console = Console(stderr=options.json)
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TimeRemainingColumn(), TextColumn("{task.fields[said]}"), console=console, disable=not console.is_terminal,
+    )  # fmt: skip
+    total = run.flights_of(tuning)
+    with (
+        Journal(folder / "flights.jsonl") as journal, workers.local(options.jobs or workers.cores()) as crew, bar,
+    ):  # fmt: skip
+        task = bar.add_task("flights", total=total, said="")
+
+        def said(trial: Any) -> None:
+            best = tuning.best
+            text = f"of {trial.number + 1} tried, lost a flight"
+            if not best.score.lost:
+                text = f"of {trial.number + 1} tried, best error {best.score.error:.4g} effort {best.score.effort:.4g}"
+            bar.update(task, said=text)
+
+        kept = flights.kept(journal, crew, lambda: bar.advance(task))
+        try:
+            run.carry_out(tuning, kept, said)
+            return _show_tuning(console, options, tuning, folder, command)
+        except KeyboardInterrupt:
+            bar.stop()
+            if tuning.trials:
+                _show_tuning(console, options, tuning, folder, command)
+            console.print(
+                f"interrupted; the same command with --run-dir {folder} goes on", soft_wrap=True, highlight=False
+            )
+            raise
+
+
+def _show_tuning(console: Any, options: argparse.Namespace, tuning: Tuning, folder: Path, command: str) -> int:
+    from rich.table import Table
+
+    from mavsitl.report.tables import number
+    from mavsitl.tune import result
+    from mavsitl.tune.page import write_page
+
+    paths = [*result.write(tuning, folder, command), write_page(tuning, folder, command)]
+    if options.json:
+        print((folder / result.JSON_FILE).read_text("utf-8"), end="")
+        return EXIT_OK
+    table = Table("measure", "seeds", title="before and after", title_justify="left", title_style="bold")
+    for column in ("before", "after", "ratio", "95 % interval", "p"):
+        table.add_column(column, justify="right")
+    for row in result.measures(tuning):
+        cells = [row.name, row.seeds, number(row.before), number(row.after)]
+        if row.paired is not None:
+            cells += [f"{row.paired.ratio:.3f}", f"{row.paired.low:.3f} to {row.paired.high:.3f}"]
+            cells.append(number(row.paired.p_value))
+        table.add_row(*cells)
+    console.print(table)
+    table = Table("key", title="gains", title_justify="left", title_style="bold")
+    for column in ("before", "after", "range", ""):
+        table.add_column(column, justify="right")
+    for gain in result.gains(tuning):
+        bound = "at its bound" if gain.at_bound else ""
+        key = gain.key.replace("[", r"\[")
+        table.add_row(key, f"{gain.before:.4g}", f"{gain.after:.4g}", f"{gain.low:.4g} to {gain.high:.4g}", bound)
+    console.print(table)
+    console.print(result.verdict(tuning), soft_wrap=True, highlight=False)
+    for path in paths:
+        console.print(str(path), soft_wrap=True, highlight=False)
+    return EXIT_OK
 
 
 def _loud(source: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -115,15 +116,11 @@ def show(record: FlightRecord, data: FlightData) -> Shown:
 
 def render(run: Run, flights: list[Shown]) -> str:
     """The page as text."""
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["number"] = tables.number
-    source = resources.files("mavsitl.report").joinpath("template.html.j2").read_text("utf-8")
     groups = _groups(flights)
     sections = zip(_titles(groups), groups, strict=True)
     compared = [row for flight in flights for row in flight.rows if row.verdict is not None]
-    return environment.from_string(source).render(
+    return fill(
+        resources.files("mavsitl.report") / "template.html.j2",
         run=run,
         sections=[_section(number, title, group) for number, (title, group) in enumerate(sections)],
         flights=flights,
@@ -132,6 +129,16 @@ def render(run: Run, flights: list[Shown]) -> str:
         oracles=[flight for flight in flights if flight.record.wind_information == "oracle"],
         symbols=tables.SYMBOLS,
     )
+
+
+def fill(template: Traversable, **values: Any) -> str:
+    """A page from a Jinja template, which has the house's `style` besides `values`, and the filter ``number``."""
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["number"] = tables.number
+    style = (resources.files("mavsitl.report") / "style.css").read_text("utf-8")
+    return environment.from_string(template.read_text("utf-8")).render(style=style, **values)
 
 
 def _load(run_folder: Path, record: FlightRecord) -> Shown:

@@ -1,0 +1,118 @@
+"""A whole tuning: search, judgement on seeds that the search has not seen, and what is to be told of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from mavsitl.tune.paired import Paired, paired
+from mavsitl.scenario import ScenarioError
+from mavsitl.tune.flights import Flights, FlyAll
+from mavsitl.tune.objective import Score
+from mavsitl.tune.search import Trial, search
+from mavsitl.tune.space import Overrides, Space, space
+
+FIRST_SEARCH_SEED = 1001
+"""Held-out seeds are 1, 2, ..., those of the project's results; a search has others."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was asked for."""
+
+    names: tuple[str, ...]
+    """Scenarios by name or path."""
+    settings: Overrides = field(default_factory=dict)
+    """Changes to all of them."""
+    asked: tuple[str, ...] = ()
+    """``KEY`` or ``KEY=LOW:HIGH[:log|linear]``; none: the default keys."""
+    evaluations: int = 150
+    effort_weight: float = 0.1
+    seeds: int = 3
+    held_out: int = 20
+    search_duration_s: float | None = None
+    """So much of each flight in the search; judged is the whole."""
+    seed: int = 1
+    """Of the search itself."""
+
+    @property
+    def search_seeds(self) -> tuple[int, ...]:
+        return tuple(range(FIRST_SEARCH_SEED, FIRST_SEARCH_SEED + self.seeds))
+
+    @property
+    def held_out_seeds(self) -> tuple[int, ...]:
+        return tuple(range(1, 1 + self.held_out))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Before and after on the held-out seeds, at full length."""
+
+    before: Score
+    after: Score
+    error: Paired
+    """After over before, seed by seed."""
+    effort: Paired
+
+
+@dataclass
+class Tuning:
+    """Grows as it goes."""
+
+    plan: Plan
+    space: Space
+    trials: list[Trial] = field(default_factory=list)
+    judged: Judged | None = None
+    """None: it was interrupted before that."""
+
+    @property
+    def start(self) -> Trial:
+        return self.trials[0]
+
+    @property
+    def best(self) -> Trial:
+        """The first of the least objective."""
+        return min(self.trials, key=lambda trial: trial.score.objective(self.plan.effort_weight))
+
+
+def begin(plan: Plan) -> Tuning:
+    """Raises `ScenarioError` for what is wrong with the scenarios or the keys."""
+    if not plan.seeds < FIRST_SEARCH_SEED > plan.held_out:
+        raise ScenarioError(f"held-out seeds from 1 on must stay below {FIRST_SEARCH_SEED}, the search's first")
+    return Tuning(plan, space(plan.names, plan.settings, plan.asked))
+
+
+def searched(tuning: Tuning) -> Flights:
+    """What a candidate flies in the search."""
+    plan = tuning.plan
+    return Flights(plan.names, plan.settings, tuning.space, plan.search_seeds, plan.search_duration_s)
+
+
+def held_out(tuning: Tuning) -> Flights:
+    """What start and chosen fly in the end."""
+    plan = tuning.plan
+    return Flights(plan.names, plan.settings, tuning.space, plan.held_out_seeds)
+
+
+def flights_of(tuning: Tuning) -> int:
+    """How many there are to fly in all, at most."""
+    return searched(tuning).each * tuning.plan.evaluations + 2 * held_out(tuning).each
+
+
+def carry_out(tuning: Tuning, fly_all: FlyAll, said: Callable[[Trial], None]) -> None:
+    """Search and judge; what is in `tuning` when it is interrupted is good. `said` is told of each trial."""
+    plan, flights = tuning.plan, searched(tuning)
+
+    def evaluate(values: tuple[float, ...]) -> Score:
+        return flights.scores([values], fly_all)[0]
+
+    def keep(trial: Trial) -> None:
+        tuning.trials.append(trial)
+        said(trial)
+
+    search(
+        tuning.space, evaluate, keep,
+        evaluations=plan.evaluations, effort_weight=plan.effort_weight, seed=plan.seed,
+    )  # fmt: skip
+    before, after = held_out(tuning).scores([tuning.start.values, tuning.best.values], fly_all)
+    tuning.judged = Judged(before, after, paired(after.errors, before.errors), paired(after.efforts, before.efforts))
