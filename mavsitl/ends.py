@@ -80,7 +80,7 @@ IMPAIRED_GRACE_S = 300.0
 """Over an impaired link a flight in lock-step that takes so much longer than its scenario says will never end."""
 
 
-def _channels(flight: Flight) -> Channels | None:
+def lockstep_channels(flight: Flight) -> Channels | None:
     """Of the off-board link in lock-step; None where each tick is answered."""
     if not flight.scenario.impaired:
         return None
@@ -95,12 +95,18 @@ def _watch_lockstep_link(core: Any, channels: Channels | None, recorder: Recorde
         return
     from mavsitl.log.links import LinkLog
 
+    change_by_parameters(core, channels)
+    tap.record = LinkLog(recorder, lambda: {"link": channels}).write
+
+
+def change_by_parameters(core: Any, channels: Channels) -> None:
+    """What the vehicle's parameters say of the off-board link is laid over it, in lock-step."""
+
     def listen(link: LinkName, overlay: Overlay) -> None:
         if link == "link":
             channels.lay_over(overlay)
 
     _subscribe(core, listen)
-    tap.record = LinkLog(recorder, lambda: {"link": channels}).write
 
 
 def _subscribe(core: Any, listener: Callable[[LinkName, Overlay], None]) -> None:
@@ -312,7 +318,7 @@ def vehicle_lockstep(
                 flight, recorder, seed=flight.scenario.seed, system_id=system_id, ports=("offboard",), lockstep=True
             )
             watch = _Watch(core)
-            channels = _channels(flight)
+            channels = lockstep_channels(flight)
             _watch_lockstep_link(core, channels, recorder, tap)
             end_us = drivers.run_lockstep_vehicle(
                 core, link, tap, deadline_s=deadline_s, cpu=cpu, progress=progress,
@@ -465,7 +471,7 @@ def in_memory(
         vehicle = wings.find(wings.VEHICLE_GROUP)(flight, vehicle_recorder, seed=flight.scenario.seed, lockstep=True)
         ground = wings.find(wings.GROUND_GROUP)(flight, ground_recorder, report=report)
         watch = _Watch(ground)
-        channels = _channels(flight)
+        channels = lockstep_channels(flight)
         _watch_lockstep_link(vehicle, channels, vehicle_recorder, tap)
         limit_s = inf if channels is None else flight.scenario.duration_s + IMPAIRED_GRACE_S
         end_us = drivers.fly_in_memory(vehicle, ground, tap, max_time_s=limit_s, progress=progress, channels=channels)
