@@ -425,8 +425,8 @@ def _add_tune(commands: Any) -> None:
         "--evaluations", type=_whole(1, 1_000_000), default=150, metavar="N", help="candidates (default: 150)"
     )
     group.add_argument(
-        "--effort-weight", type=_not_negative, default=0.1, metavar="W",
-        help="what 1 %% of effort has to buy, in %% of error (default: 0.1)",
+        "--effort-weight", type=_not_negative, default=0.3, metavar="W",
+        help="what 1 %% of effort has to buy, in %% of error (default: 0.3)",
     )  # fmt: skip
     group.add_argument(
         "--seeds", type=_whole(1, 1000), default=3, metavar="N", help="flown by each candidate: 1001, ... (default: 3)"

@@ -10,13 +10,13 @@ from pathlib import Path
 import msgspec
 
 import mavsitl
-from mavsitl.tune.paired import Paired
 from mavsitl.keep import replace_file
 from mavsitl.report.metrics import LABELS, UNITS, paper_case
 from mavsitl.report.tables import number
 from mavsitl.scenario import Flight, Waypoints, load
 from mavsitl.tune import toml
 from mavsitl.tune.objective import Score, scale
+from mavsitl.tune.paired import Paired
 from mavsitl.tune.run import Tuning
 from mavsitl.tune.space import ITEM
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from mavsitl.tune.paired import Paired, paired
 from mavsitl.scenario import ScenarioError
 from mavsitl.tune.flights import Flights, FlyAll
 from mavsitl.tune.objective import Score
+from mavsitl.tune.paired import Paired, paired
 from mavsitl.tune.search import Trial, search
 from mavsitl.tune.space import Overrides, Space, space
 
@@ -27,7 +27,7 @@ class Plan:
     asked: tuple[str, ...] = ()
     """``KEY`` or ``KEY=LOW:HIGH[:log|linear]``; none: the default keys."""
     evaluations: int = 150
-    effort_weight: float = 0.1
+    effort_weight: float = 0.3
     seeds: int = 3
     held_out: int = 20
     search_duration_s: float | None = None
