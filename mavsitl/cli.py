@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mavsitl.report.run import FlightRecord
     from mavsitl.scenario import Flight
     from mavsitl.tune.run import Tuning
+    from mavsitl.tune.search import Trial
 
 PAPER_SCENARIOS = ("hover-calm", "hover-wind", "spiral-calm", "spiral-wind")
 
@@ -285,6 +286,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _exit_code(error: Exception) -> int | None:
     """Of an error whose text is for the user; None for any other. They are loaded here: most runs have none."""
+    from mavsitl.campaign.store import StoreError
+    from mavsitl.campaign.workers import WorkerError
     from mavsitl.chaos.table import ChaosError
     from mavsitl.ends import ExposedError
     from mavsitl.link.address import AddressError
@@ -293,11 +296,13 @@ def _exit_code(error: Exception) -> int | None:
     from mavsitl.pair import PairError
     from mavsitl.report.run import RunError
     from mavsitl.scenario import ScenarioError
+    from mavsitl.tune.objective import TuneError
     from mavsitl.wings import WingError
 
     if isinstance(error, (UsageError, ExposedError, ScenarioError, ChaosError, AddressError, WingError)):
         return EXIT_USAGE
-    return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RunError)) else None
+    failed = (LinkError, LogError, PairError, RunError, StoreError, WorkerError, TuneError)
+    return EXIT_FAILED if isinstance(error, failed) else None
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -865,18 +870,19 @@ def _tune(options: argparse.Namespace) -> int:
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         TimeRemainingColumn(), TextColumn("{task.fields[said]}"), console=console, disable=not console.is_terminal,
     )  # fmt: skip
-    total = run.flights_of(tuning)
+    per_candidate = run.searched(tuning).each
     with (
         Journal(folder / "flights.jsonl") as journal, workers.local(options.jobs or workers.cores()) as crew, bar,
     ):  # fmt: skip
-        task = bar.add_task("flights", total=total, said="")
+        task = bar.add_task("flights", total=run.flights_of(tuning), said="")
 
-        def said(trial: Any) -> None:
-            best = tuning.best
-            text = f"of {trial.number + 1} tried, lost a flight"
-            if not best.score.lost:
-                text = f"of {trial.number + 1} tried, best error {best.score.error:.4g} effort {best.score.effort:.4g}"
-            bar.update(task, said=text)
+        def said(trial: Trial) -> None:
+            if trial.number == 0 and trial.score.lost:
+                text = f"the gains to begin with lose {trial.score.lost} of {per_candidate} flights: "
+                console.print(text + trial.score.message, soft_wrap=True, highlight=False)
+            best = tuning.best.score
+            found = "all lost" if best.lost else f"best error {best.error:.4g}, effort {best.effort:.4g}"
+            bar.update(task, said=f"{trial.number + 1} tried, {found}")
 
         kept = flights.kept(journal, crew, lambda: bar.advance(task))
         try:

@@ -492,7 +492,8 @@ def names() -> list[str]:
 def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
     """Read a shipped scenario by name, or a file by path.
 
-    `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``. Raises `ScenarioError`.
+    `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``; what stands beside one that the file leaves out
+    keeps its default. Raises `ScenarioError`.
     """
     text, where, folder = _read("scenarios", name_or_path, names())
     data = _parse(text, where)
@@ -545,11 +546,21 @@ def _parse(text: str, where: str) -> dict[str, Any]:
 def _override(data: dict[str, Any], key: str, value: Any, where: str) -> None:
     *parents, last = key.split(".")
     table = data
+    default: Any = Scenario(title="")
     for parent in parents:
-        table = table.setdefault(parent, {})
+        default = getattr(default, parent, None)
+        table = table.setdefault(parent, _whole(default))
         if not isinstance(table, dict):
             raise ScenarioError(f"{where}: {key}: '{parent}' is not a table, so it has no key to set")
     table[last] = value
+
+
+def _whole(default: Any) -> dict[str, Any]:
+    """A table to set one key in: its default where it is one that must be given whole, as `Gains`."""
+    if isinstance(default, Section) and any(field.required for field in msgspec.structs.fields(default)):
+        table: dict[str, Any] = msgspec.to_builtins(default)
+        return table
+    return {}
 
 
 def _convert(data: dict[str, Any], kind: type[Any], where: str) -> Any:

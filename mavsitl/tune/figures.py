@@ -31,10 +31,10 @@ def trade_off(tuning: Tuning) -> Drawing:
 
     def draw(figure: Figure) -> None:
         axes = _axes(figure, 1)[0]
-        efforts, errors = np.array(points).T
+        efforts, errors = np.array(points).reshape(-1, 2).T
         axes.plot(efforts, errors, ".", color=TRIED, markersize=6, label="tried")
         axes.step(
-            *np.array(best).T, where="post", color=FRONT, linewidth=1.2, marker="o", markersize=4,
+            *np.array(best).reshape(-1, 2).T, where="post", color=FRONT, linewidth=1.2, marker="o", markersize=4,
             label="not beaten in both",
         )  # fmt: skip
         chosen = tuning.best.score
@@ -51,8 +51,8 @@ def trade_off(tuning: Tuning) -> Drawing:
             )
         axes.set_xlabel(EFFORT)
         axes.set_ylabel(ERROR)
-        axes.set_yscale("log")
-        _plain(axes)
+        if flown:
+            _logarithmic(axes)
         figure.legend(*axes.get_legend_handles_labels(), loc="upper right", ncols=5, borderaxespad=0.2)
 
     said = f"; {lost} lost a flight and are not shown" if lost else ""
@@ -70,6 +70,8 @@ def convergence(tuning: Tuning) -> Drawing:
     flown = np.array([not trial.score.lost for trial in tuning.trials])
 
     def draw(figure: Figure) -> None:
+        from matplotlib.ticker import MaxNLocator
+
         rows = _axes(figure, 2)
         for axes, name in zip(rows, ("error", "effort"), strict=True):
             values = np.array([getattr(trial.score, name) for trial in tuning.trials])
@@ -78,11 +80,12 @@ def convergence(tuning: Tuning) -> Drawing:
             axes.step(numbers, so_far, where="post", color=CHOSEN, linewidth=1.4, label="best so far")
             for number in numbers[~flown]:
                 axes.axvline(number, color="#a3241b", linewidth=0.6, alpha=0.35)
-        rows[0].set_yscale("log")
-        _plain(rows[0])
+        if flown.any():
+            _logarithmic(rows[0])
         rows[0].set_ylabel(ERROR)
         rows[1].set_ylabel(EFFORT)
         rows[1].set_xlabel("evaluation")
+        rows[1].xaxis.set_major_locator(MaxNLocator(integer=True))
         figure.legend(*rows[0].get_legend_handles_labels(), loc="upper right", ncols=2, borderaxespad=0.2)
 
     said = "; red lines: a flight was lost" if not flown.all() else ""
@@ -96,10 +99,13 @@ def _axes(figure: Figure, rows: int) -> list[Axes]:
     return list(grid[:, 0])
 
 
-def _plain(axes: Axes) -> None:
-    """Numbers at a logarithmic axis as they are said, not as powers of ten."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+def _logarithmic(axes: Axes) -> None:
+    """With numbers as they are said, not as powers of ten, and enough of them."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, StrMethodFormatter
 
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0), numticks=12))
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    near = high < 5.0 * low
+    axes.yaxis.set_major_locator(MaxNLocator(6) if near else LogLocator(subs=(1.0, 2.0, 3.0, 5.0), numticks=12))
+    axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())

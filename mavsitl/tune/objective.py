@@ -16,6 +16,11 @@ from mavsitl.tune.space import Floats
 
 Six = tuple[float, float, float, float, float, float]
 
+
+class TuneError(RuntimeError):
+    """The tuning cannot be done; the message says why."""
+
+
 SCALE: Six = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)
 """By what the RMSE of a flight that is none of the paper's is divided: m and degrees."""
 
@@ -44,6 +49,8 @@ class Score:
     """Flights lost or failed."""
     rmse: tuple[Six, ...]
     """A scenario each: root of the mean square over seeds; infinite where a flight was lost."""
+    message: str = ""
+    """How the first was lost."""
 
     @cached_property
     def error(self) -> float:
@@ -67,10 +74,16 @@ class Score:
 
 
 def score(rows: Sequence[Sequence[Row]], scales: Sequence[Six], durations_s: Sequence[float]) -> Score:
-    """`rows[scenario][seed]`, the same seeds for each scenario; a scale and a duration for each scenario."""
+    """`rows[scenario][seed]`, the same seeds for each scenario; a scale and a duration for each scenario.
+
+    Raises `TuneError` where the vehicle's log has no rotor speeds.
+    """
+    if any(row.flown and row.effort_rad_s is None for each in rows for row in each):
+        raise TuneError("the vehicle logs no rotor speeds, so its effort is not known")
+    bad = [row for each in rows for row in each if not row.flown]
     squares = np.array([[(inf,) * 6 if row.rmse is None else np.square(row.rmse) for row in each] for each in rows])
     rmse: Floats = np.sqrt(squares)
-    efforts = np.array([[inf if row.rmse is None else row.effort_rad_s or 0.0 for row in each] for each in rows])
+    efforts = np.array([[row.effort_rad_s if row.flown else inf for row in each] for each in rows], np.float64)
     flown = [
         1.0 if row.flown else min(row.time_s / duration_s, 1.0)
         for each, duration_s in zip(rows, durations_s, strict=True)
@@ -81,8 +94,9 @@ def score(rows: Sequence[Sequence[Row]], scales: Sequence[Six], durations_s: Seq
         errors=tuple(relative.mean(axis=(0, 2)).tolist()),
         efforts=tuple(efforts.mean(axis=0).tolist()),
         unflown=1.0 - float(np.mean(flown)),
-        lost=sum(not row.flown for each in rows for row in each),
+        lost=len(bad),
         rmse=tuple(_six(each) for each in np.sqrt(squares.mean(axis=1))),
+        message=f"{bad[0].scenario}, seed {bad[0].seed}: {bad[0].message}" if bad else "",
     )
 
 

@@ -45,26 +45,25 @@ def search(
     effort_weight: float,
     seed: int,
 ) -> None:
-    """`evaluations` candidates, the start first; `said` is told of each as it is flown.
+    """`evaluations` different candidates, the start first; `said` is told of each as it is flown.
 
     The same seed and the same scores give the same candidates, so a search whose flights are kept goes on where it was
-    ended when it is begun anew. A candidate that comes again counts, and is not evaluated again.
+    ended when it is begun anew. It ends early where there is nothing new to try.
     """
     from scipy.optimize import minimize
 
     known: dict[tuple[float, ...], Score] = {}
-    number = 0
     best, best_place = np.inf, space.start_place
 
     def objective(place: Floats) -> float:
-        nonlocal number, best, best_place
-        if number == evaluations:
-            raise _SpentError
+        nonlocal best, best_place
         values = space.values(place)
         if values not in known:
-            known[values] = evaluate(values)
-        said(Trial(number, values, known[values]))
-        number += 1
+            if len(known) == evaluations:
+                raise _SpentError
+            score = evaluate(values)
+            said(Trial(len(known), values, score))
+            known[values] = score
         found = known[values].objective(effort_weight)
         if found < best:
             best, best_place = found, np.array(place)
@@ -74,7 +73,9 @@ def search(
     place = space.start_place
     try:
         objective(place)  # COBYQA itself begins elsewhere when that is near a bound
-        while True:
+        before = 0
+        while before < len(known):
+            before = len(known)
             minimize(
                 objective, place, method="COBYQA", bounds=[(0.0, 1.0)] * place.size,
                 options={"initial_tr_radius": FIRST_STEP, "final_tr_radius": LAST_STEP},

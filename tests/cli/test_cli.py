@@ -19,11 +19,14 @@ from mavsitl import __version__, cli, pair, scenario
 from mavsitl.cli import main
 from mavsitl.link.udp import LOOPBACK
 
-COMMANDS = ("fly", "vehicle", "ground", "check", "link", "inject", "param", "report", "scenarios", "chaos")
+COMMANDS = ("fly", "tune", "vehicle", "ground", "check", "link", "inject", "param", "report", "scenarios", "chaos")
 
 HELP = {
     "fly": ("--seed", "--airframe", "--law", "--level", "--wind-information", "--duration", "--set", "--run-dir",
             "--in-memory", "--no-report", "--json", "report.html", "mavsitl fly hover-wind --law pid"),
+    "tune": ("--tune", "--evaluations", "--effort-weight", "--seeds", "--held-out", "--search-duration",
+             "--search-seed", "--jobs", "--run-dir", "--set", "--json", "tune.html", "flights.jsonl",
+             "mavsitl tune my.toml"),
     "vehicle": ("--instance", "--system", "--bind", "--offboard-port", "--offboard-remote", "--gcs-port",
                 "--gcs-remote", "--lockstep", "--deadline", "--run-dir", "--wing", "--status", "--speed",
                 "--until-disarmed", "--chaos", "14580", "18570", "mavsitl vehicle hover-wind --instance 1"),
