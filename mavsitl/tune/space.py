@@ -142,63 +142,6 @@ def space(names: Sequence[str], settings: Overrides, asked: Sequence[str]) -> Sp
     return made
 
 
-def rounded(value: float) -> float:
-    """To `DIGITS` significant digits."""
-    return float(f"{value:.{DIGITS}g}")
-
-
-def default_keys(controller: Controller) -> tuple[str, ...]:
-    """What is worth tuning of what such a controller reads."""
-    keys = [f"controller.{loop}.{gain}" for loop in ("altitude", "position") for gain in _GAINS]
-    keys.append("controller.angle_filter_rad_s")
-    if controller.level != "attitude" or controller.inner == "pidnn":
-        keys += [f"controller.{loop}.{gain}" for loop in ("roll_pitch", "yaw") for gain in _GAINS]
-        if controller.law == "pidnn":
-            keys.append("controller.learning.rate")
-    if controller.wind_information == "observer":
-        keys += ["controller.wind_observer.horizontal_rad_s", "controller.wind_observer.vertical_rad_s"]
-    return tuple(keys)
-
-
-_GAINS = ("k_p_per_s2", "k_i_per_s3", "k_d_per_s")
-
-
-def space(names: Sequence[str], settings: Overrides, asked: Sequence[str]) -> Space:
-    """The space of `asked`, each ``KEY`` or ``KEY=LOW:HIGH[:log|linear]``; the default keys where nothing is asked.
-
-    `names` are scenarios by name or path, changed by `settings`. Raises `ScenarioError` for a key that no scenario has
-    or that is no gain, a range that is none or that the scenario does not allow, and scenarios that differ in a key.
-    """
-    flights = [load(name, settings) for name in names]
-    texts = list(asked)
-    if not texts:
-        wanted = dict.fromkeys(key for flight in flights for key in default_keys(flight.scenario.controller))
-        texts = [key for key in wanted if any(_numbers(_find(flights[0], key)))]
-    dials, start, lists = [], [], {}
-    for text in texts:
-        key, equals, bounds = (part.strip() for part in text.partition("="))
-        value, items = _present(key, names, flights)
-        low, high, scale = _bounds(text, bounds, value) if equals else _around(key, value)
-        if not low <= value <= high:
-            raise ScenarioError(f"--tune {text}: the search begins at the scenario's value, {value:g}, outside of it")
-        dials.append(Dial(key, low, high, scale))
-        start.append(value)
-        if items is not None:
-            lists[ITEM.sub(r"\g<key>", key)] = items
-    for key, same in groupby(sorted(ITEM.sub(r"\g<key>", dial.key) for dial in dials)):
-        named = [dial.key for dial in dials if ITEM.sub(r"\g<key>", dial.key) == key]
-        if len(list(same)) != len(set(named)) or (len(named) > 1 and key in named):
-            raise ScenarioError(f"--tune {key}: given twice")
-    made = Space(tuple(dials), tuple(start), lists)
-    for index, dial in enumerate(dials):
-        for bound in (dial.low, dial.high):
-            values = list(start)
-            values[index] = bound
-            for name in names:
-                load(name, copy.deepcopy(settings) | made.overrides(values))
-    return made
-
-
 def _present(key: str, names: Sequence[str], flights: Sequence[Flight]) -> tuple[float, tuple[float, ...] | None]:
     """The value that the scenarios have for `key`, and the whole array that it is of."""
     if not key.startswith(("controller.", "parameters.")):
