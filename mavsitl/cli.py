@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
+import shlex
 import signal
 import sys
 import tomllib
@@ -19,6 +21,11 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
     from mavsitl.ask import Reply, Task
+    from mavsitl.campaign.fly import Row
+    from mavsitl.campaign.store import Journal
+    from mavsitl.campaign.summary import Summary
+    from mavsitl.campaign.sweep import Known, Plan
+    from mavsitl.campaign.workers import Workers
     from mavsitl.check import Heard, PortReport, Report
     from mavsitl.ends import Outcome
     from mavsitl.report.run import FlightRecord
@@ -48,6 +55,7 @@ A quadrotor in Dryden wind and an off-board controller, two processes that meet 
   mavsitl link         make the links of a flying vehicle bad, and good again
   mavsitl inject       break a part of a flying vehicle
   mavsitl param        read and set parameters
+  mavsitl sweep        fly a grid of settings and seeds, and compare
 """
 
 EPILOG = """\
@@ -90,8 +98,10 @@ and how far, with :log or :linear behind it for how the range is divided; withou
 five times that; without --tune it is every gain, filter, learning rate and observer bandwidth that the controller
 reads. An array such as controller.learning.rate is turned as one, or item by item: controller.learning.rate[0].
 
-The run folder gets each scenario with the gains found, tune.json with every candidate, tune.html, one self-contained
-page, and flights.jsonl, every flight so far: the same command with the same --run-dir goes on where it was ended.
+The folder gets each scenario with the gains found, tune.json with every candidate, report.html, one self-contained
+page, and rows.jsonl, every flight so far: the same command goes on where it was ended. Ctrl-C gives the best so far.
+
+SEEDS is N for 1 to N, or FIRST-LAST, or N,N,N; those to search on and those to judge by have none in common.
 """
 
 TUNE_EXAMPLES = """\
@@ -99,7 +109,8 @@ examples:
   mavsitl tune                                       the paper's controller on the paper's four experiments
   mavsitl tune hover-wind-realistic --jobs 8 --evaluations 300
   mavsitl tune my.toml --tune controller.position.k_p_per_s2=1:20 --tune controller.learning.rate=1:100:log
-  mavsitl tune hover-wind --search-duration 20 --effort-weight 0.5 --run-dir runs/gentle
+  mavsitl tune hover-wind --search-duration 20 --effort-weight 0.5 --output runs/gentle
+  mavsitl tune --seeds 2001-2008 --held-out 50 --scheduler tcp://192.0.2.7:8786
 """
 
 VEHICLE_HELP = """\
@@ -215,6 +226,34 @@ examples:
   mavsitl param list "SIM_*"
 """
 
+SWEEP_HELP = """\
+Fly every combination of the settings with every seed: whole flights in memory, on all cores of this machine or on a
+Dask cluster. Each flight is a row: flown, lost (too far from its reference), or failed, with what went wrong.
+
+The folder gets rows.jsonl, row by row, then results.parquet and report.html. A sweep that was interrupted or killed
+goes on with the same command. A flight is known by its scenario, airframe, seed and the code that flies: where one of
+these has changed it is flown again, else it is not.
+
+  --set KEY=A,B,C            these values; an array or table of TOML is one value
+  --set KEY=START:STOP:STEP  a range, STOP included: 0:10:5 is 0, 5, 10
+  --set KEY=A                this value in every flight
+  --seeds N                  seeds 1 to N; also N,N,N and FIRST-LAST
+
+A key with two values is compared seed by seed: the same seed is the same air and the same noise.
+"""
+
+SWEEP_EXAMPLES = """\
+examples:
+  mavsitl sweep hover-wind --set wind.speed_20ft_m_s=0,5,10 --seeds 50
+  mavsitl sweep hover-wind --set controller.law=pid,pidnn --seeds 50 --jobs 4
+  mavsitl sweep spiral-wind --set offnominal.mass_scale=0.8:1.4:0.1 --compare controller.law=pid,pidnn
+  mavsitl sweep my.toml --compare controller.learning.rate=[0,0,0],[1,1,1],[10,10,10] --seeds 20
+  mavsitl sweep hover-wind --seeds 1000 --scheduler tcp://192.0.2.7:8786
+
+Exit codes: 0 every flight has its row, lost ones too; 1 some failed by an error, or the sweep did; 2 wrong arguments;
+130 interrupted.
+"""
+
 ASK_EPILOG = """
 Exit codes: 0 done; 1 refused, or no answer (the message says by whom and what to do); 2 wrong arguments.
 """
@@ -286,8 +325,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _exit_code(error: Exception) -> int | None:
     """Of an error whose text is for the user; None for any other. They are loaded here: most runs have none."""
-    from mavsitl.campaign.store import StoreError
-    from mavsitl.campaign.workers import WorkerError
+    from mavsitl.campaign.errors import CampaignError, GridError
     from mavsitl.chaos.table import ChaosError
     from mavsitl.ends import ExposedError
     from mavsitl.link.address import AddressError
@@ -296,13 +334,11 @@ def _exit_code(error: Exception) -> int | None:
     from mavsitl.pair import PairError
     from mavsitl.report.run import RunError
     from mavsitl.scenario import ScenarioError
-    from mavsitl.tune.objective import TuneError
     from mavsitl.wings import WingError
 
-    if isinstance(error, (UsageError, ExposedError, ScenarioError, ChaosError, AddressError, WingError)):
+    if isinstance(error, (UsageError, ExposedError, ScenarioError, GridError, ChaosError, AddressError, WingError)):
         return EXIT_USAGE
-    failed = (LinkError, LogError, PairError, RunError, StoreError, WorkerError, TuneError)
-    return EXIT_FAILED if isinstance(error, failed) else None
+    return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RunError, CampaignError)) else None
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -318,6 +354,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_link(commands)
     _add_inject(commands)
     _add_param(commands)
+    _add_sweep(commands)
     _add_report(commands)
     _add_scenarios(commands)
     _add_chaos(commands)
@@ -434,11 +471,9 @@ def _add_tune(commands: Any) -> None:
         help="what 1 %% of effort has to buy, in %% of error (default: 0.3)",
     )  # fmt: skip
     group.add_argument(
-        "--seeds", type=_whole(1, 1000), default=3, metavar="N", help="flown by each candidate: 1001, ... (default: 3)"
+        "--seeds", default="1001-1003", metavar="SEEDS", help="flown by each candidate (default: 1001-1003)"
     )
-    group.add_argument(
-        "--held-out", type=_whole(1, 1000), default=20, metavar="N", help="judged on: 1, 2, ... (default: 20)"
-    )
+    group.add_argument("--held-out", default="20", metavar="SEEDS", help="judged by (default: 20, which is 1 to 20)")
     group.add_argument(
         "--search-duration", type=_above_zero, metavar="S",
         help="fly so much of each flight in the search; judged is the whole (default: all of it)",
@@ -447,10 +482,15 @@ def _add_tune(commands: Any) -> None:
         "--search-seed", type=_whole(0, 2**31), default=1, metavar="N", help="of the search itself (default: 1)"
     )
     group = parser.add_argument_group("run")
+    group.add_argument("--jobs", type=_whole(1, 4096), metavar="N", help="processes (default: one for each core)")
     group.add_argument(
-        "--jobs", type=_whole(1, 1024), metavar="N", help="processes; 1 is this one alone (default: one a core)"
-    )
-    group.add_argument("--run-dir", type=Path, metavar="DIR", help="run folder (default: runs/tune-<UTC time>)")
+        "--scheduler", type=_scheduler, metavar="ADDRESS",
+        help="of a Dask cluster, tcp://HOST:PORT, in place of processes",
+    )  # fmt: skip
+    group.add_argument(
+        "--output", type=Path, metavar="DIR",
+        help="folder (default: runs/tune-SCENARIO); what is there is gone on with",
+    )  # fmt: skip
     group.add_argument("--json", action="store_true", help="print tune.json and nothing else")
     parser.set_defaults(run=_tune)
 
@@ -626,6 +666,44 @@ def _add_param(commands: Any) -> None:
     parser.add_argument("names", nargs="*", metavar="NAME[=VALUE]", help="with list a pattern such as 'SIM_*'")
     _add_ask_options(parser, "udpout:127.0.0.1:18570 + I")
     parser.set_defaults(run=_param)
+
+
+def _add_sweep(commands: Any) -> None:
+    parser = _command(commands, "sweep", "fly a grid of settings and seeds, and compare", SWEEP_HELP, SWEEP_EXAMPLES)
+    parser.add_argument("scenario", metavar="SCENARIO", help="a shipped scenario's name or a .toml file")
+    group = parser.add_argument_group("grid")
+    group.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUES", dest="settings",
+        help="any key of the scenario, dotted, with its values; may be repeated",
+    )  # fmt: skip
+    group.add_argument(
+        "--compare", action="append", default=[], metavar="KEY=VALUES",
+        help="as --set, and each further value is compared with the first, seed by seed; may be repeated",
+    )  # fmt: skip
+    group.add_argument("--seeds", default="10", metavar="SEEDS", help="default: 10, which is 1 to 10")
+    group = parser.add_argument_group("run")
+    group.add_argument("--jobs", type=_whole(1, 4096), metavar="N", help="processes (default: one for each core)")
+    group.add_argument(
+        "--scheduler",
+        type=_scheduler,
+        metavar="ADDRESS",
+        help="of a Dask cluster, tcp://HOST:PORT, in place of processes",
+    )
+    group.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder (default: runs/sweep-SCENARIO); what is there is gone on with",
+    )
+    group.add_argument("--no-report", action="store_true", help="results and tables only")
+    group.add_argument("--json", action="store_true", help="print the summary as JSON and nothing else")
+    parser.set_defaults(run=_sweep)
+
+
+def _scheduler(text: str) -> str:
+    if not re.fullmatch(r"(tcp|tls|ucx|wss?)://\S+:\d+", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: tcp://HOST:PORT or tls://HOST:PORT")
+    return text
 
 
 def _add_ask_options(parser: argparse.ArgumentParser, default: str) -> None:
@@ -837,8 +915,6 @@ def _show(console: Any, options: argparse.Namespace, folder: Path, records: list
 
 
 def _tune(options: argparse.Namespace) -> int:
-    import shlex
-
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -850,57 +926,59 @@ def _tune(options: argparse.Namespace) -> int:
     )
 
     from mavsitl.campaign import workers
+    from mavsitl.campaign.grid import parse_seeds
     from mavsitl.campaign.store import Journal
-    from mavsitl.clock import utc_stamp
     from mavsitl.tune import flights, run
 
     _on_signals(_interrupt)
+    if options.jobs is not None and options.scheduler is not None:
+        raise UsageError("--jobs: not with --scheduler, whose workers are what they are")
     plan = run.Plan(
         names=tuple(options.scenarios or PAPER_SCENARIOS), settings=_overrides(_settings(options)),
         asked=tuple(options.keys), evaluations=options.evaluations, effort_weight=options.effort_weight,
-        seeds=options.seeds, held_out=options.held_out, search_duration_s=options.search_duration,
-        seed=options.search_seed,
+        seeds=parse_seeds(options.seeds), held_out=parse_seeds(options.held_out),
+        search_duration_s=options.search_duration, seed=options.search_seed,
     )  # fmt: skip
     tuning = run.begin(plan)
-    created = utc_stamp()
-    folder: Path = options.run_dir or Path("runs") / ("tune-" + created.replace(":", "").replace("-", ""))
-    command = shlex.join(["mavsitl", *sys.argv[1:]])
-    console = Console(stderr=options.json)
+    name = Path(plan.names[0]).stem if len(plan.names) == 1 else "several" if options.scenarios else "paper"
+    folder: Path = options.output or Path("runs") / f"tune-{name}"
+    command = "mavsitl " + shlex.join(sys.argv[1:])
+    console = Console(stderr=options.json, highlight=False)
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TimeRemainingColumn(), TextColumn("{task.fields[said]}"), console=console, disable=not console.is_terminal,
+        TextColumn("{task.description}"), *columns, TextColumn("{task.fields[said]}"),
+        console=Console(stderr=True, highlight=False),
     )  # fmt: skip
-    per_candidate = run.searched(tuning).each
-    with (
-        Journal(folder / "flights.jsonl") as journal, workers.local(options.jobs or workers.cores()) as crew, bar,
-    ):  # fmt: skip
-        task = bar.add_task("flights", total=run.flights_of(tuning), said="")
+    each = run.searched(tuning).each
+    jobs = options.jobs or min(workers.cores(), each)
+    crew = workers.Dask(options.scheduler) if options.scheduler else workers.local(jobs)
+    with Journal(folder / "rows.jsonl") as journal, crew, bar:
+        task = bar.add_task("tune", total=run.flights_of(tuning), said="")
 
         def said(trial: Trial) -> None:
             if trial.number == 0 and trial.score.lost:
-                text = f"the gains to begin with lose {trial.score.lost} of {per_candidate} flights: "
-                console.print(text + trial.score.message, soft_wrap=True, highlight=False)
+                text = f"the gains to begin with lose {trial.score.lost} of {each} flights: {trial.score.message}"
+                bar.console.print(text, soft_wrap=True, markup=False)
             best = tuning.best.score
             found = "all lost" if best.lost else f"best error {best.error:.4g}, effort {best.effort:.4g}"
             bar.update(task, said=f"{trial.number + 1} tried, {found}")
 
-        kept = flights.kept(journal, crew, lambda: bar.advance(task))
         try:
-            run.carry_out(tuning, kept, said)
-            return _show_tuning(console, options, tuning, folder, command)
+            run.carry_out(tuning, flights.kept(journal, crew, lambda: bar.advance(task)), said)
         except KeyboardInterrupt:
             bar.stop()
             if tuning.trials:
                 _show_tuning(console, options, tuning, folder, command)
-            console.print(
-                f"interrupted; the same command with --run-dir {folder} goes on", soft_wrap=True, highlight=False
-            )
+            console.print(f"interrupted; the same command goes on from {folder}", soft_wrap=True, markup=False)
             raise
+    return _show_tuning(console, options, tuning, folder, command)
 
 
 def _show_tuning(console: Any, options: argparse.Namespace, tuning: Tuning, folder: Path, command: str) -> int:
+    from rich.markup import escape
     from rich.table import Table
 
+    from mavsitl.report.sweep_tables import bounds, probability
     from mavsitl.report.tables import number
     from mavsitl.tune import result
     from mavsitl.tune.page import write_page
@@ -910,14 +988,13 @@ def _show_tuning(console: Any, options: argparse.Namespace, tuning: Tuning, fold
         print((folder / result.JSON_FILE).read_text("utf-8"), end="")
         return EXIT_OK
     table = Table("measure", "seeds", title="before and after", title_justify="left", title_style="bold")
-    for column in ("before", "after", "ratio", "95 % interval", "p"):
+    for column in ("before", "after", "ratio, seed by seed", "p"):
         table.add_column(column, justify="right")
     for row in result.measures(tuning):
         cells = [row.name, row.seeds, number(row.before), number(row.after)]
         if row.paired is not None:
-            cells += [f"{row.paired.ratio:.3f}", f"{row.paired.low:.3f} to {row.paired.high:.3f}"]
-            cells.append(number(row.paired.p_value))
-        table.add_row(*cells)
+            cells += [bounds(row.paired.ratio), probability(row.paired.p_value)]
+        table.add_row(*(escape(cell) for cell in cells))
     console.print(table)
     table = Table("key", title="gains", title_justify="left", title_style="bold")
     for column in ("before", "after", "range", ""):
@@ -927,9 +1004,9 @@ def _show_tuning(console: Any, options: argparse.Namespace, tuning: Tuning, fold
         key = gain.key.replace("[", r"\[")
         table.add_row(key, f"{gain.before:.4g}", f"{gain.after:.4g}", f"{gain.low:.4g} to {gain.high:.4g}", bound)
     console.print(table)
-    console.print(result.verdict(tuning), soft_wrap=True, highlight=False)
+    console.print(result.verdict(tuning), soft_wrap=True, markup=False)
     for path in paths:
-        console.print(str(path), soft_wrap=True, highlight=False)
+        console.print(str(path), soft_wrap=True, markup=False)
     return EXIT_OK
 
 
@@ -1400,6 +1477,128 @@ def _wish(text: str, to_set: bool) -> tuple[str, float | None]:
     except ValueError:
         raise UsageError(f"{text}: {value!r} is not a number") from None
     return name, number
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from mavsitl.campaign import optional, sweep, workers
+    from mavsitl.campaign.store import Journal
+    from mavsitl.clock import utc_stamp
+
+    _on_signals(_interrupt)
+    if options.jobs is not None and options.scheduler is not None:
+        raise UsageError("--jobs: not with --scheduler, whose workers are what they are")
+    plan = sweep.plan(options.scenario, options.settings, options.compare, options.seeds)
+    optional.need("pyarrow")  # before anything flies
+    name = plan.cases[0].flight.name
+    folder: Path = options.output or Path("runs") / f"sweep-{name}"
+    console = Console(stderr=options.json, highlight=False)
+    console.print(f"[bold]{name}[/]  {plan}", soft_wrap=True)
+    with Journal(folder / sweep.JOURNAL_FILE) as journal:
+        known = sweep.known(plan, journal)
+        for text in _told(known, len(plan.cases), folder):
+            console.print(text, soft_wrap=True, markup=False)
+        missing = len(plan.cases) - known.flown
+        if missing:
+            crew = workers.Dask(options.scheduler) if options.scheduler else workers.local(
+                min(options.jobs or workers.cores(), missing)
+            )  # fmt: skip
+            with crew:
+                _fly_missing(plan, journal, crew, known.flown, folder)
+        rows = sweep.rows(plan, journal)
+    command = "mavsitl " + shlex.join(sys.argv[1:])
+    results = sweep.save(plan, rows, folder, command, utc_stamp())
+    summary = sweep.summary(plan, rows)
+    if options.json:
+        _print_sweep_json(results, rows, summary)
+    else:
+        _show_sweep(console, rows, summary)
+    console.print(f"results: {results}", soft_wrap=True, markup=False)
+    failed = [row for row in rows if row.status == "failed"]
+    if failed:
+        said = sorted({row.message for row in failed})
+        console.print(f"{len(failed)} of {len(rows)} failed: {said[0]}", soft_wrap=True, markup=False, style="bold red")
+    return EXIT_FAILED if failed else EXIT_OK
+
+
+def _told(known: Known, total: int, folder: Path) -> list[str]:
+    """What of a sweep need not be flown again, and what has to, and why."""
+    told = []
+    if known.flown:
+        told.append(f"{known.flown} of {total} were flown before ({folder})")
+    if known.other_code:
+        told.append(f"{known.other_code} of {total} were flown before by other code, and are flown again")
+    if known.other_scenario:
+        told.append(
+            f"{known.other_scenario} of {total} were flown before with other settings or another scenario file, "
+            "and are flown again"
+        )
+    return told
+
+
+def _fly_missing(plan: Plan, journal: Journal, crew: Workers, before: int, folder: Path) -> None:
+    """With a progress bar on stderr."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from mavsitl.campaign import sweep
+
+    console = Console(stderr=True, highlight=False)
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    total, done = len(plan.cases), before
+    counts = {"lost": 0, "failed": 0}
+    with Progress(*columns, TextColumn("{task.fields[said]}"), console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("flights", total=total, completed=before, said="")
+        try:
+            for row in sweep.fly(plan, journal, crew):
+                done += 1
+                if not row.flown:
+                    counts[row.status] += 1
+                said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+                bar.update(task, advance=1, said=said)
+        except BaseException:
+            bar.stop()
+            console.print(
+                f"{done} of {total} are in {folder}; the same command goes on with the rest",
+                soft_wrap=True, markup=False,
+            )  # fmt: skip
+            raise
+
+
+def _print_sweep_json(results: Path, rows: Sequence[Row], summary: Summary) -> None:
+    import msgspec
+
+    counts = {status: sum(row.status == status for row in rows) for status in ("flown", "lost", "failed")}
+    shown = {"results": str(results), "flights": len(rows), **counts, **msgspec.to_builtins(summary)}
+    print(msgspec.json.format(msgspec.json.encode(shown), indent=2).decode())
+
+
+def _show_sweep(console: Console, rows: Sequence[Row], summary: Summary) -> None:
+    from rich.table import Table
+
+    from mavsitl.report import sweep_tables
+
+    table = Table(title="medians and their 95 % intervals", title_justify="left", title_style="")
+    for column in sweep_tables.cell_header(summary):
+        table.add_column(column, justify="right")
+    for cells in sweep_tables.cell_rows(summary):
+        table.add_row(*cells)
+    console.print(table)
+    if summary.comparisons:
+        table = Table(title="seed by seed: median difference", title_justify="left", title_style="")
+        for column in sweep_tables.comparison_header():
+            table.add_column(column, justify="right")
+        for cells in sweep_tables.comparison_rows(summary):
+            table.add_row(*cells)
+        console.print(table)
 
 
 def _report(options: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ what is allowed for whatever it does not accept.
 
 from __future__ import annotations
 
+import re
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -88,7 +89,8 @@ class Gust(Section, frozen=True, tag_field="model", tag="gust"):
 class DrydenPaper(Section, frozen=True, tag_field="model", tag="dryden-paper"):
     """Eqs 14-17 with Table 1's numbers (sigma_v = sigma_u^2 / sigma_w as printed, metres in the formulas)."""
 
-    wind_speed_20ft_m_s: Positive = 10.0
+    speed_20ft_m_s: NonNegative = 10.0
+    """0: no turbulence."""
     altitude_m: Positive = 1.0
     form: Literal["first-order", "spectrum"] = "first-order"
     """``first-order``: the filters of eq 17; ``spectrum``: second-order v and w filters that have eq 14's densities."""
@@ -99,7 +101,8 @@ class DrydenPaper(Section, frozen=True, tag_field="model", tag="dryden-paper"):
 class DrydenMil(Section, frozen=True, tag_field="model", tag="dryden-mil"):
     """MIL-F-8785C / MIL-HDBK-1797 low-altitude model, turned with the mean wind; the mean included on request."""
 
-    wind_speed_20ft_m_s: Positive
+    speed_20ft_m_s: NonNegative
+    """0: no turbulence, no mean."""
     altitude_m: Annotated[float, msgspec.Meta(gt=0.0, le=304.8)]
     from_deg: float = 0.0
     """Where the mean wind comes from, clockwise from north."""
@@ -492,8 +495,9 @@ def names() -> list[str]:
 def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
     """Read a shipped scenario by name, or a file by path.
 
-    `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``; what stands beside one that the file leaves out
-    keeps its default. Raises `ScenarioError`.
+    `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``; through an array of tables they go by the index,
+    ``wind[0].altitude_m``, or without it where there is one alone. What stands beside a key in a table that the file
+    leaves out keeps its default. Raises `ScenarioError`.
     """
     text, where, folder = _read("scenarios", name_or_path, names())
     data = _parse(text, where)
@@ -507,6 +511,11 @@ def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
     _check(scenario, where)
     name = name_or_path.removesuffix(".toml").replace("\\", "/").rsplit("/", 1)[-1]
     return Flight(name=name, scenario=scenario, airframe=load_airframe(scenario.airframe, folder))
+
+
+def text_of(name_or_path: str) -> str:
+    """The scenario's file as it is. Raises `ScenarioError`."""
+    return _read("scenarios", name_or_path, names())[0]
 
 
 def load_airframe(name_or_path: str, folder: Path | None = None) -> Airframe:
@@ -543,15 +552,32 @@ def _parse(text: str, where: str) -> dict[str, Any]:
         raise ScenarioError(f"{where}: not valid TOML: {error}") from error
 
 
+_STEP = re.compile(r"([^\[\]]+)(?:\[(\d+)\])?")
+"""A part of a dotted key, e.g. ``wind[0]``, as the messages about a scenario have it."""
+
+
 def _override(data: dict[str, Any], key: str, value: Any, where: str) -> None:
     *parents, last = key.split(".")
     table = data
+    path = ""
     default: Any = Scenario(title="")
     for parent in parents:
-        default = getattr(default, parent, None)
-        table = table.setdefault(parent, _whole(default))
+        step = _STEP.fullmatch(parent)
+        if step is None:
+            raise ScenarioError(
+                f"{where}: {key}: '{parent}' is no part of a key; allowed: NAME or NAME[0], NAME[1], ..."
+            )
+        name, index = step[1], step[2]
+        path = _join(path, name)
+        default = getattr(default, name, None)
+        table = table.setdefault(name, _whole(default))
+        if isinstance(table, list):
+            table = _element(table, index, path, key, where)
+            path += f"[{index or 0}]"
+        elif index is not None:
+            raise ScenarioError(f"{where}: {key}: '{path}' is no array, so it has no element {index}")
         if not isinstance(table, dict):
-            raise ScenarioError(f"{where}: {key}: '{parent}' is not a table, so it has no key to set")
+            raise ScenarioError(f"{where}: {key}: '{path}' is not a table, so it has no key to set")
     table[last] = value
 
 
@@ -561,6 +587,18 @@ def _whole(default: Any) -> dict[str, Any]:
         table: dict[str, Any] = msgspec.to_builtins(default)
         return table
     return {}
+
+
+def _element(array: list[Any], index: str | None, path: str, key: str, where: str) -> Any:
+    """Of an array of tables: the one with that index, or without it the only one."""
+    if index is None and len(array) == 1:
+        return array[0]
+    if not array:
+        raise ScenarioError(f"{where}: {key}: '{path}' is empty, so it has no element to set")
+    if index is None or int(index) >= len(array):
+        allowed = ", ".join(f"{path}[{number}]" for number in range(len(array)))
+        raise ScenarioError(f"{where}: {key}: '{path}' has {len(array)} element(s); allowed: {allowed}")
+    return array[int(index)]
 
 
 def _convert(data: dict[str, Any], kind: type[Any], where: str) -> Any:

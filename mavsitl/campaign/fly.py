@@ -54,7 +54,8 @@ class Row(msgspec.Struct, frozen=True):
     scenario_digest: str = ""
     """As in `run.json` of `mavsitl fly`."""
     wire_hash: str = ""
-    """Of all bytes that crossed the wire, as `mavsitl fly` prints it; up to its end, of a lost flight."""
+    """Of all bytes that crossed the wire, as `mavsitl fly` prints it, of a lost flight up to its end; empty where the
+    worker was lost."""
     code: str = ""
     """`grid.source_digest` of what flew it."""
     cpu_s: float = 0.0
@@ -63,6 +64,11 @@ class Row(msgspec.Struct, frozen=True):
     @property
     def flown(self) -> bool:
         return self.status == "flown"
+
+    @property
+    def repeatable(self) -> bool:
+        """It would end so again; one that took its worker with it may not."""
+        return self.wire_hash != ""
 
     @property
     def states(self) -> Rmse:

@@ -1,22 +1,22 @@
-"""Rows on the disk: a journal that a kill leaves readable."""
+"""Rows on the disk: a journal that a kill leaves readable, and Parquet at the end."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from mavsitl.campaign import optional
+from mavsitl.campaign.errors import StoreError
 from mavsitl.campaign.fly import Row
+from mavsitl.keep import replace_file
 
 if TYPE_CHECKING:
     from io import FileIO
-
-
-class StoreError(ValueError):
-    """What is on the disk cannot be used; the message names the file and what to do."""
 
 
 class Journal:
@@ -97,3 +97,62 @@ class Journal:
             self.rows[row.key] = row
         if tail:
             self._file.truncate(len(data) - len(tail))
+
+
+STATES = ("x_m", "y_m", "z_m", "phi_deg", "theta_deg", "psi_deg")
+PREFIX = "mavsitl."
+"""Of the names in a Parquet file's metadata."""
+
+
+def columns(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Any]]:
+    """A table's columns: a row's fields flat, `keys` of its labels under their own names, None where there is none.
+
+    A key whose values are not all numbers, all texts or all true or false has them as JSON.
+    """
+    table: dict[str, list[Any]] = {
+        name: [getattr(row, name) for row in rows] for name in ("scenario", "scenario_digest", "seed")
+    }
+    for key in keys:
+        table[key] = _alike([row.labels.get(key) for row in rows])
+    for name in ("status", "message", "time_s"):
+        table[name] = [getattr(row, name) for row in rows]
+    for name in ("position_m", "attitude_deg"):
+        table[f"rmse_{name}"] = [getattr(row, name) if row.flown else None for row in rows]
+    for index, state in enumerate(STATES):
+        table[f"rmse_{state}"] = [None if row.rmse is None else row.rmse[index] for row in rows]
+        table[f"max_{state}"] = [None if row.largest is None else row.largest[index] for row in rows]
+    table["effort_rad_s"] = [row.effort_rad_s for row in rows]
+    for index, end in enumerate(("min", "max")):
+        table[f"weight_{end}"] = [row.weight_range[index] for row in rows]
+    for name in ("left_offboard", "key", "code", "wire_hash", "cpu_s"):
+        table[name] = [getattr(row, name) for row in rows]
+    return table
+
+
+def _alike(values: list[Any]) -> list[Any]:
+    kinds = {type(value) for value in values}
+    if kinds <= {int, float}:
+        return [float(value) for value in values] if float in kinds else values
+    if kinds in ({str}, {bool}):
+        return values
+    return [msgspec.json.encode(value, order="deterministic").decode() for value in values]
+
+
+def write_parquet(path: Path, rows: Sequence[Row], keys: Sequence[str], metadata: Mapping[str, str]) -> None:
+    """`columns` as a Parquet file, whole or not at all; `metadata` under `PREFIX` in its schema.
+
+    Raises `StoreError`, and `optional.MissingError` without pyarrow.
+    """
+    optional.need("pyarrow")
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    named = {f"{PREFIX}{name}": value for name, value in metadata.items()}
+    table = pa.table(columns(rows, keys)).replace_schema_metadata(named)
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, sink.getvalue().to_pybytes())
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error

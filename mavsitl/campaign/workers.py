@@ -8,17 +8,23 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import platform
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import islice
 from multiprocessing import connection
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
+from uuid import uuid4
 
-from mavsitl.campaign import fly
+import mavsitl
+from mavsitl.campaign import fly, optional
+from mavsitl.campaign.errors import WorkerError
 from mavsitl.campaign.fly import Row
-from mavsitl.campaign.grid import Case
+from mavsitl.campaign.grid import Case, source_digest
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -34,10 +40,6 @@ ENDING_S = 5.0
 
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA")
 _ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
-
-
-class WorkerError(RuntimeError):
-    """The workers cannot work; the message says which and what to do."""
 
 
 class Workers(Protocol):
@@ -230,3 +232,122 @@ def _one_thread() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+CONNECT_S = 10.0
+"""Wall clock for a Dask scheduler to answer, and for its first worker to be there."""
+AHEAD = 4
+"""Tasks handed to a cluster for each of its threads: none waits for the client, and few are left at an interruption."""
+
+
+class Dask:
+    """The workers of an existing Dask cluster. A worker that is lost has its task given to another, by Dask.
+
+    They need the same mavsitl with the same source. Raises `WorkerError`.
+    """
+
+    def __init__(self, address: str) -> None:
+        """`address` of the scheduler, ``tcp://HOST:PORT``."""
+        optional.need("distributed")
+        from distributed import Client
+
+        self._address = address
+        try:
+            self._client = Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise WorkerError(f"no Dask scheduler answers at {address}: {error}") from error
+        try:
+            self._check_workers()
+        except BaseException:
+            self._client.close()
+            raise
+
+    def __enter__(self) -> Dask:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._client.close()
+
+    @property
+    def threads(self) -> int:
+        """Of all workers that are there now."""
+        return sum(self._client.nthreads().values())
+
+    def map(
+        self, function: Callable[[S], T], items: Iterable[S], lost: Callable[[S, str], T] | None = None
+    ) -> Iterator[tuple[int, T]]:
+        from distributed import CancelledError, KilledWorker, as_completed
+
+        mine = about()
+        remaining = enumerate(items)
+        under_way: dict[Any, tuple[int, S]] = {}
+        coming = as_completed(loop=self._client.loop)
+
+        def give(count: int) -> None:
+            for index, item in islice(remaining, count):
+                future = self._client.submit(_checked, mine, function, item, key=f"mavsitl-{uuid4().hex}")
+                under_way[future] = (index, item)
+                coming.add(future)
+
+        try:
+            give(max(AHEAD * self.threads, 1))
+            for future in coming:
+                index, item = under_way.pop(future)
+                try:
+                    result = future.result()
+                except KilledWorker as error:
+                    text = f"every Dask worker that flew it was lost: {error}"
+                    if lost is None:
+                        raise WorkerError(text) from error
+                    result = lost(item, text)
+                except CancelledError as error:
+                    raise WorkerError(f"the Dask scheduler at {self._address} went away") from error
+                give(1)
+                yield index, result
+        finally:
+            if under_way:
+                with suppress(OSError, TimeoutError):  # of a scheduler that is gone
+                    self._client.cancel(list(under_way), force=True)
+
+    def _check_workers(self) -> None:
+        """Of those that are there; one that comes later is checked when it gets its first task."""
+        try:
+            self._client.wait_for_workers(1, timeout=CONNECT_S)
+        except TimeoutError as error:
+            raise WorkerError(
+                f"the Dask scheduler at {self._address} has no worker; one is started by: "
+                f"dask worker {self._address} --nthreads 1"
+            ) from error
+        try:
+            found: dict[str, About] = self._client.run(about)
+        except Exception as error:
+            raise WorkerError(
+                f"a worker of {self._address} cannot load mavsitl {mavsitl.__version__} ({error}); "
+                "install the same version in the workers' environment"
+            ) from error
+        for worker, its in found.items():
+            _compare(about(), its, worker)
+
+
+About: TypeAlias = dict[str, str]
+
+
+def about() -> About:
+    """What has to be the same for a flight to be the same: this process's."""
+    return {
+        "mavsitl": mavsitl.__version__,
+        "source": source_digest()[:12],
+        "Python": f"{sys.version_info.major}.{sys.version_info.minor}",
+    }
+
+
+def _compare(ours: About, its: About, worker: str) -> None:
+    if its != ours:
+        there, here = (", ".join(f"{name} {value}" for name, value in each.items()) for each in (its, ours))
+        raise WorkerError(f"{worker} has {there}, and here is {here}; install the same in both places")
+
+
+def _checked(expected: About, function: Callable[[S], T], item: S) -> T:
+    """On a worker of the cluster."""
+    _compare(expected, about(), f"a worker on {platform.node()}")
+    return function(item)

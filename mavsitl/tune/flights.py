@@ -24,11 +24,12 @@ def kept(journal: Journal, workers: Workers, flown: Callable[[], None] = lambda:
     """Flies what is not in the journal, and keeps it there. `flown` is told of each flight, flown or found."""
 
     def each_once(cases: Sequence[Case]) -> Iterator[Row]:
-        found = [journal.rows[each.key] for each in cases if each.key in journal.rows]
-        for row in found:
-            flown()
-            yield row
-        for row in fly_all([each for each in cases if each.key not in journal.rows], workers):
+        found = {key: row for key, row in journal.rows.items() if row.repeatable}
+        for each in cases:
+            if each.key in found:
+                flown()
+                yield found[each.key]
+        for row in fly_all([each for each in cases if each.key not in found], workers):
             journal.add(row)
             flown()
             yield row

@@ -9,6 +9,7 @@ from math import inf, log
 
 import numpy as np
 
+from mavsitl.campaign.errors import CampaignError
 from mavsitl.campaign.fly import Row
 from mavsitl.report.metrics import PAPER_TABLES, paper_case
 from mavsitl.scenario import Scenario
@@ -17,7 +18,7 @@ from mavsitl.tune.space import Floats
 Six = tuple[float, float, float, float, float, float]
 
 
-class TuneError(RuntimeError):
+class TuneError(CampaignError):
     """The tuning cannot be done; the message says why."""
 
 

@@ -1,4 +1,4 @@
-"""`tune.html`: what was found, how, and what it costs, on one self-contained page."""
+"""`report.html`: what was found, how, and what it costs, on one self-contained page."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import mavsitl
 from mavsitl.keep import replace_file
 from mavsitl.report import figures as drawings
 from mavsitl.report.html import fill
+from mavsitl.report.sweep_tables import bounds, probability
 from mavsitl.tune import figures, result
 from mavsitl.tune.run import Tuning
 
-PAGE_FILE = "tune.html"
+PAGE_FILE = "report.html"
 
 
 def write_page(tuning: Tuning, folder: Path, command: str) -> Path:
@@ -35,8 +36,8 @@ def render(tuning: Tuning, command: str) -> str:
         command=command,
         version=mavsitl.__version__,
         trials=len(tuning.trials),
-        searched=result.span(tuning.plan.search_seeds),
-        held_out=result.span(tuning.plan.held_out_seeds),
+        searched=result.span(tuning.plan.seeds),
+        held_out=result.span(tuning.plan.held_out),
         judged=tuning.judged is not None,
         measures=list(result.measures(tuning)),
         effort_weight=tuning.plan.effort_weight,
@@ -45,4 +46,6 @@ def render(tuning: Tuning, command: str) -> str:
         gains=result.gains(tuning),
         states=[(name, list(rows)) for name, rows in groupby(result.states(tuning), lambda row: row.scenario)],
         infinite=inf,
+        bounds=bounds,
+        probability=probability,
     )

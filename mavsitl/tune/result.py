@@ -12,6 +12,7 @@ import msgspec
 import mavsitl
 from mavsitl.keep import replace_file
 from mavsitl.report.metrics import LABELS, UNITS, paper_case
+from mavsitl.report.sweep_tables import bounds
 from mavsitl.report.tables import number
 from mavsitl.scenario import Flight, Waypoints, load
 from mavsitl.tune import toml
@@ -68,17 +69,20 @@ class State:
 
 
 def span(seeds: tuple[int, ...]) -> str:
-    return f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+    """E.g. ``1 to 20``."""
+    if len(seeds) > 2 and seeds == tuple(range(seeds[0], seeds[-1] + 1)):
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(map(str, seeds))
 
 
 def measures(tuning: Tuning) -> Iterator[Measure]:
-    searched = f"searched: {span(tuning.plan.search_seeds)}"
+    searched = f"searched: {span(tuning.plan.seeds)}"
     start, best = tuning.start.score, tuning.best.score
     yield Measure("error", searched, start.error, best.error, None)
     yield Measure("effort / (rad/s)", searched, start.effort, best.effort, None)
     judged = tuning.judged
     if judged is not None:
-        held_out = f"held out: {span(tuning.plan.held_out_seeds)}"
+        held_out = f"held out: {span(tuning.plan.held_out)}"
         yield Measure("error", held_out, judged.before.error, judged.after.error, judged.error)
         yield Measure("effort / (rad/s)", held_out, judged.before.effort, judged.after.effort, judged.effort)
 
@@ -129,9 +133,8 @@ def verdict(tuning: Tuning) -> str:
         return f"Nothing better than the start was found in {len(tuning.trials)} evaluations."
     if judged.after.lost or judged.before.lost:
         return f"On the held-out seeds {judged.before.lost} flights were lost before, and {judged.after.lost} after."
-    change = f"error x {judged.error.ratio:.3f} (95 % interval {judged.error.low:.3f} to {judged.error.high:.3f})"
-    effort = f"effort x {judged.effort.ratio:.3f}"
-    return f"On {len(judged.after.errors)} held-out seeds: {change}, {effort}."
+    change = f"error x {bounds(judged.error.ratio)}, effort x {bounds(judged.effort.ratio)}"
+    return f"Held-out seeds {span(tuning.plan.held_out)}, medians with 95 % intervals: {change}."
 
 
 def write(tuning: Tuning, folder: Path, command: str) -> list[Path]:

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from mavsitl.scenario import ScenarioError
+from mavsitl.campaign.errors import GridError
 from mavsitl.tune.flights import Flights, FlyAll
 from mavsitl.tune.objective import Score
 from mavsitl.tune.paired import Paired, paired
 from mavsitl.tune.search import Trial, search
 from mavsitl.tune.space import Overrides, Space, space
-
-FIRST_SEARCH_SEED = 1001
-"""Held-out seeds are 1, 2, ..., those of the project's results; a search has others."""
 
 
 @dataclass(frozen=True)
@@ -28,20 +25,14 @@ class Plan:
     """``KEY`` or ``KEY=LOW:HIGH[:log|linear]``; none: the default keys."""
     evaluations: int = 150
     effort_weight: float = 0.3
-    seeds: int = 3
-    held_out: int = 20
+    seeds: tuple[int, ...] = (1001, 1002, 1003)
+    """Flown by each candidate."""
+    held_out: tuple[int, ...] = tuple(range(1, 21))
+    """Flown by start and chosen in the end; 1 to 20 are those of the project's results."""
     search_duration_s: float | None = None
     """So much of each flight in the search; judged is the whole."""
     seed: int = 1
     """Of the search itself."""
-
-    @property
-    def search_seeds(self) -> tuple[int, ...]:
-        return tuple(range(FIRST_SEARCH_SEED, FIRST_SEARCH_SEED + self.seeds))
-
-    @property
-    def held_out_seeds(self) -> tuple[int, ...]:
-        return tuple(range(1, 1 + self.held_out))
 
 
 @dataclass(frozen=True)
@@ -76,22 +67,23 @@ class Tuning:
 
 
 def begin(plan: Plan) -> Tuning:
-    """Raises `ScenarioError` for what is wrong with the scenarios or the keys."""
-    if not plan.seeds < FIRST_SEARCH_SEED > plan.held_out:
-        raise ScenarioError(f"held-out seeds from 1 on must stay below {FIRST_SEARCH_SEED}, the search's first")
+    """Raises `ScenarioError` for what is wrong with the scenarios or the keys, `GridError` for seeds."""
+    both = sorted(set(plan.seeds) & set(plan.held_out))
+    if both:
+        raise GridError(f"--seeds, --held-out: seed {both[0]} is in both; allowed: seeds that are in one alone")
     return Tuning(plan, space(plan.names, plan.settings, plan.asked))
 
 
 def searched(tuning: Tuning) -> Flights:
     """What a candidate flies in the search."""
     plan = tuning.plan
-    return Flights(plan.names, plan.settings, tuning.space, plan.search_seeds, plan.search_duration_s)
+    return Flights(plan.names, plan.settings, tuning.space, plan.seeds, plan.search_duration_s)
 
 
 def held_out(tuning: Tuning) -> Flights:
     """What start and chosen fly in the end."""
     plan = tuning.plan
-    return Flights(plan.names, plan.settings, tuning.space, plan.held_out_seeds)
+    return Flights(plan.names, plan.settings, tuning.space, plan.held_out)
 
 
 def flights_of(tuning: Tuning) -> int:

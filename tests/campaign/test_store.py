@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from mavsitl.campaign.errors import StoreError
 from mavsitl.campaign.fly import Row
-from mavsitl.campaign.store import Journal, StoreError
+from mavsitl.campaign.store import Journal
 
 ROWS = [
     Row(f"key {seed}", "hover-calm", seed, "flown", 2.0, (0.1 * seed,) * 6, labels={"law": "pid", "seeds": [1, 2.5]})

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from mavsitl.campaign import fly, workers
-from mavsitl.campaign.workers import Here, Local, WorkerError, Workers, fly_all
+from mavsitl.campaign.errors import WorkerError
+from mavsitl.campaign.workers import Here, Local, Workers, fly_all
 from tests.campaign import flights
 from tests.campaign.flights import measured, short
 

@@ -25,7 +25,7 @@ HELP = {
     "fly": ("--seed", "--airframe", "--law", "--level", "--wind-information", "--duration", "--set", "--run-dir",
             "--in-memory", "--no-report", "--json", "report.html", "mavsitl fly hover-wind --law pid"),
     "tune": ("--tune", "--evaluations", "--effort-weight", "--seeds", "--held-out", "--search-duration",
-             "--search-seed", "--jobs", "--run-dir", "--set", "--json", "tune.html", "flights.jsonl",
+             "--search-seed", "--jobs", "--scheduler", "--output", "--set", "--json", "report.html", "rows.jsonl",
              "mavsitl tune my.toml"),
     "vehicle": ("--instance", "--system", "--bind", "--offboard-port", "--offboard-remote", "--gcs-port",
                 "--gcs-remote", "--lockstep", "--deadline", "--run-dir", "--wing", "--status", "--speed",

@@ -186,9 +186,7 @@ class Simulation:
             x, y, z = (p["SIM_WIND_SPD"] * mil_axes(from_deg)[0]).tolist()
             winds.append(Steady(velocity_nwu_m_s=(x, y, z)))
         if p["SIM_WIND_TURB"]:
-            winds.append(
-                DrydenMil(wind_speed_20ft_m_s=p["SIM_WIND_W20"], altitude_m=TURBULENCE_HEIGHT_M, from_deg=from_deg)
-            )
+            winds.append(DrydenMil(speed_20ft_m_s=p["SIM_WIND_W20"], altitude_m=TURBULENCE_HEIGHT_M, from_deg=from_deg))
         return tuple(winds)
 
     def _set_winds(self, added: tuple[Wind, ...]) -> None:

@@ -123,6 +123,8 @@ class WindField:
                 case Gust():
                     rows.append(_gust_row(wind))
                     continue
+                case DrydenPaper(speed_20ft_m_s=0.0) | DrydenMil(speed_20ft_m_s=0.0):
+                    continue
                 case DrydenPaper():
                     axes = np.eye(3)
                     filters = dryden.shaping_filters(
