@@ -48,7 +48,6 @@ DESCRIPTION = """\
 A quadrotor in Dryden wind and an off-board controller, two processes that meet on MAVLink 2 over UDP alone.
 
   mavsitl fly          fly the paper's four experiments and write a report
-  mavsitl tune         search a controller's gains, and judge them on other seeds
   mavsitl vehicle      a vehicle alone, in real time, on PX4 SITL's ports
   mavsitl ground       the paper's controller alone, for that vehicle or any PX4-like one
   mavsitl check        who is on the ports, and does it answer: when nothing arrives
@@ -56,6 +55,7 @@ A quadrotor in Dryden wind and an off-board controller, two processes that meet 
   mavsitl inject       break a part of a flying vehicle
   mavsitl param        read and set parameters
   mavsitl sweep        fly a grid of settings and seeds, and compare
+  mavsitl tune         search a controller's gains, and judge them on other seeds
 """
 
 EPILOG = """\
@@ -347,7 +347,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"mavsitl {__version__}")
     commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
     _add_fly(commands)
-    _add_tune(commands)
     _add_vehicle(commands)
     _add_ground(commands)
     _add_check(commands)
@@ -355,6 +354,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_inject(commands)
     _add_param(commands)
     _add_sweep(commands)
+    _add_tune(commands)
     _add_report(commands)
     _add_scenarios(commands)
     _add_chaos(commands)
@@ -978,12 +978,12 @@ def _show_tuning(console: Any, options: argparse.Namespace, tuning: Tuning, fold
     from rich.markup import escape
     from rich.table import Table
 
+    from mavsitl.report import tune as report
     from mavsitl.report.sweep_tables import bounds, probability
     from mavsitl.report.tables import number
     from mavsitl.tune import result
-    from mavsitl.tune.page import write_page
 
-    paths = [*result.write(tuning, folder, command), write_page(tuning, folder, command)]
+    paths = [*result.write(tuning, folder, command), report.write(tuning, folder, command)]
     if options.json:
         print((folder / result.JSON_FILE).read_text("utf-8"), end="")
         return EXIT_OK
@@ -1507,14 +1507,21 @@ def _sweep(options: argparse.Namespace) -> int:
             with crew:
                 _fly_missing(plan, journal, crew, known.flown, folder)
         rows = sweep.rows(plan, journal)
-    command = "mavsitl " + shlex.join(sys.argv[1:])
-    results = sweep.save(plan, rows, folder, command, utc_stamp())
+    facts = sweep.metadata(plan, "mavsitl " + shlex.join(sys.argv[1:]), utc_stamp())
+    results = sweep.save(plan, rows, folder, facts)
     summary = sweep.summary(plan, rows)
+    page = None
+    if not options.no_report:
+        from mavsitl.report import sweep as report
+
+        page = report.write(folder, rows, summary, plan.grid.keys, facts)
     if options.json:
         _print_sweep_json(results, rows, summary)
     else:
-        _show_sweep(console, rows, summary)
-    console.print(f"results: {results}", soft_wrap=True, markup=False)
+        _show_sweep(console, summary)
+    for what, path in (("results", results), ("report", page)):
+        if path is not None:
+            console.print(f"{what + ':':8s} {path}", soft_wrap=True, markup=False)
     failed = [row for row in rows if row.status == "failed"]
     if failed:
         said = sorted({row.message for row in failed})
@@ -1581,22 +1588,21 @@ def _print_sweep_json(results: Path, rows: Sequence[Row], summary: Summary) -> N
     print(msgspec.json.format(msgspec.json.encode(shown), indent=2).decode())
 
 
-def _show_sweep(console: Console, rows: Sequence[Row], summary: Summary) -> None:
+def _show_sweep(console: Console, summary: Summary) -> None:
+    from rich import box
     from rich.table import Table
 
     from mavsitl.report import sweep_tables
 
-    table = Table(title="medians and their 95 % intervals", title_justify="left", title_style="")
-    for column in sweep_tables.cell_header(summary):
-        table.add_column(column, justify="right")
-    for cells in sweep_tables.cell_rows(summary):
-        table.add_row(*cells)
-    console.print(table)
+    shown = [("medians, 95 % intervals", sweep_tables.cell_header(summary), sweep_tables.cell_rows(summary))]
     if summary.comparisons:
-        table = Table(title="seed by seed: median difference", title_justify="left", title_style="")
-        for column in sweep_tables.comparison_header():
-            table.add_column(column, justify="right")
-        for cells in sweep_tables.comparison_rows(summary):
+        header, rows = list(sweep_tables.COMPARISON_HEADER), sweep_tables.comparison_rows(summary)
+        shown.append(("seed by seed: median difference and ratio, Wilcoxon's p", header, rows))
+    for title, header, rows in shown:
+        table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+        for column in header:
+            table.add_column(column, justify="left" if column in ("", "measure") else "right")
+        for cells in rows:
             table.add_row(*cells)
         console.print(table)
 

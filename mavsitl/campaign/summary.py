@@ -38,6 +38,10 @@ class Measure:
     """Infinite for a flight that was not flown to its end."""
 
     @property
+    def headline(self) -> str:
+        return self.name[0].upper() + self.name[1:]
+
+    @property
     def title(self) -> str:
         return f"{self.name} / {self.unit}"
 
@@ -87,7 +91,7 @@ class Paired(msgspec.Struct, frozen=True):
 
     difference: Interval
     """Median of second minus first."""
-    ratio: float | None
+    ratio: Interval
     """Median of second over first."""
     p_value: float | None
     """Wilcoxon's signed-rank test, two-sided; None without a pair."""
@@ -210,12 +214,12 @@ def paired(pairs: Sequence[tuple[float, float]]) -> Paired:
 
     pairs = [(a, b) for a, b in pairs if isfinite(a) and isfinite(b)]
     if not pairs:
-        return Paired(Interval(None), None, None)
+        return Paired(Interval(None), Interval(None), None)
     differences = [b - a for a, b in pairs]
     ratios = [b / a for a, b in pairs if a > 0.0]
     return Paired(
         interval(differences, np.median),
-        quantile(ratios, 0.5) if ratios else None,
+        interval(ratios, np.median) if ratios else Interval(None),
         float(wilcoxon(differences).pvalue) if any(differences) else 1.0,
     )
 

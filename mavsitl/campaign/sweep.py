@@ -6,7 +6,7 @@ results.parquet and report.html are of the last sweep that came to its end.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -138,8 +138,8 @@ def metadata(plan: Plan, command: str, created_utc: str) -> dict[str, str]:
     }
 
 
-def save(plan: Plan, rows: Sequence[Row], folder: Path, command: str, created_utc: str) -> Path:
-    """Write results.parquet. Raises `StoreError`, `MissingError`."""
+def save(plan: Plan, rows: Sequence[Row], folder: Path, facts: Mapping[str, str]) -> Path:
+    """Write results.parquet with `facts` in its schema. Raises `StoreError`, `MissingError`."""
     path = folder / RESULTS_FILE
-    write_parquet(path, rows, plan.grid.keys, metadata(plan, command, created_utc))
+    write_parquet(path, rows, plan.grid.keys, facts)
     return path

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass
 from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +15,9 @@ from mavsitl.log.ulog import LogError
 from mavsitl.report import figures, metrics, tables
 from mavsitl.report.figures import CALM, WIND, Drawing
 from mavsitl.report.run import FlightRecord, Run, RunError, load_run
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 REPORT_FILE = "report.html"
 
@@ -119,8 +121,7 @@ def render(run: Run, flights: list[Shown]) -> str:
     groups = _groups(flights)
     sections = zip(_titles(groups), groups, strict=True)
     compared = [row for flight in flights for row in flight.rows if row.verdict is not None]
-    return fill(
-        resources.files("mavsitl.report") / "template.html.j2",
+    return template("template.html.j2").render(
         run=run,
         sections=[_section(number, title, group) for number, (title, group) in enumerate(sections)],
         flights=flights,
@@ -131,14 +132,18 @@ def render(run: Run, flights: list[Shown]) -> str:
     )
 
 
-def fill(template: Traversable, **values: Any) -> str:
-    """A page from a Jinja template, which has the house's `style` besides `values`, and the filter ``number``."""
-    from jinja2 import Environment, StrictUndefined
+def template(name: str) -> Template:
+    """One of this package's, with escaping on and the filter `number`."""
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    def read(name: str) -> str:
+        return resources.files("mavsitl.report").joinpath(name).read_text("utf-8")
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(read)
+    )
     environment.filters["number"] = tables.number
-    style = (resources.files("mavsitl.report") / "style.css").read_text("utf-8")
-    return environment.from_string(template.read_text("utf-8")).render(style=style, **values)
+    return environment.get_template(name)
 
 
 def _load(run_folder: Path, record: FlightRecord) -> Shown:

@@ -2,54 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
 from mavsitl.campaign.grid import Labels
-from mavsitl.campaign.summary import MEASURES, CellSummary, Comparison, Interval, Summary
+from mavsitl.campaign.summary import MEASURES, CellSummary, Comparison, Interval, Paired, Summary
 from mavsitl.report.tables import number
 
 
 def cell_header(summary: Summary) -> list[str]:
-    keys = list(summary.cells[0].labels)
-    return [*keys, "flown", *(measure.title for measure in MEASURES.values())]
+    return [*short(list(summary.cells[0].labels)), "flown", *(measure.title for measure in MEASURES.values())]
 
 
 def cell_rows(summary: Summary) -> list[list[str]]:
-    """The cells' medians with their intervals; how many were flown to their end."""
+    """The cells' medians, each with its interval on a second line; how many were flown to their end."""
     return [
-        [*map(shown, cell.labels.values()), flown(cell), *(bounds(each.median) for each in cell.measures.values())]
+        [*map(shown, cell.labels.values()), flown(cell), *(_stacked(each.median) for each in cell.measures.values())]
         for cell in summary.cells
     ]
 
 
-def comparison_header() -> list[str]:
-    header = ["", "in", "pairs"]
-    for name in COMPARED:
-        header += [MEASURES[name].title, "ratio", "p"]
-    return header
-
-
+COMPARISON_HEADER = ("", "measure", "pairs", "difference", "ratio", "p")
 COMPARED = ("position_m", "attitude_deg")
+"""Measures that settings are compared by."""
 
 
 def comparison_rows(summary: Summary) -> list[list[str]]:
-    rows = []
-    for each in summary.comparisons:
-        row = [versus(each), described(each.labels), str(each.pairs)]
-        for name in COMPARED:
-            paired = each.measures[name]
-            row += [
-                bounds(paired.difference, signed=True),
-                "" if paired.ratio is None else f"{paired.ratio:.3f}",
-                probability(paired.p_value),
-            ]
-        rows.append(row)
-    return rows
+    """Each comparison by each measure."""
+    return [
+        [
+            "\n".join(filter(None, (versus(each), described(each.labels)))) if name == COMPARED[0] else "",
+            MEASURES[name].title, str(each.pairs), _stacked(each.measures[name].difference, signed=True),
+            factor(each.measures[name].ratio.value), probability(each.measures[name].p_value),
+        ]
+        for each in summary.comparisons
+        for name in COMPARED
+    ]  # fmt: skip
+
+
+def _stacked(interval: Interval, *, signed: bool = False) -> str:
+    return bounds(interval, signed=signed).replace(" [", "\n[")
+
+
+def factor(value: float | None) -> str:
+    """To a part in a thousand."""
+    return "" if value is None else f"{value:.3f}"
 
 
 def versus(each: Comparison) -> str:
+    """``pidnn against pid``"""
     return f"{shown(each.second)} against {shown(each.first)}"
 
 
@@ -61,7 +64,7 @@ def flown(cell: CellSummary) -> str:
 
 
 def bounds(interval: Interval, *, signed: bool = False) -> str:
-    """``0.123 [0.120, 0.126]``; what a lost flight made is ``lost``."""
+    """``0.123 [0.120, 0.126]``; what a flight that was not flown to its end made is ``lost``."""
     if interval.value is None:
         return "lost"
     sign = "+" if signed and interval.value > 0.0 else ""
@@ -77,9 +80,15 @@ def probability(p_value: float | None) -> str:
     return f"{p_value:.1e}" if p_value < 0.001 else f"{p_value:.3f}"
 
 
+def short(keys: Sequence[str]) -> list[str]:
+    """Each key by its last part, where no other has the same."""
+    last = [key.rpartition(".")[2] for key in keys]
+    return [end if last.count(end) == 1 else key for key, end in zip(keys, last, strict=True)]
+
+
 def described(labels: Labels) -> str:
-    """``wind.speed_20ft_m_s = 5, controller.law = pid``"""
-    return ", ".join(f"{key} = {shown(value)}" for key, value in labels.items())
+    """``speed_20ft_m_s = 5, law = pid``"""
+    return ", ".join(f"{key} = {shown(value)}" for key, value in zip(short(list(labels)), labels.values(), strict=True))
 
 
 def shown(value: Any) -> str:
@@ -91,3 +100,22 @@ def shown(value: Any) -> str:
             return f"{value:g}"
         case _:
             return msgspec.json.encode(value).decode()
+
+
+def known(value: float | None, otherwise: str = "lost") -> str:
+    return otherwise if value is None else number(value)
+
+
+def signed(value: float | None) -> str:
+    return "" if value is None else f"{'+' if value > 0.0 else ''}{number(value)}"
+
+
+SURE, SLIGHT = 0.05, 5e-4
+
+
+def verdict(paired: Paired) -> str:
+    """``better``, ``worse``, or ``open`` where chance could have made it, or the ratio is 1 to three digits."""
+    change = None if paired.ratio.value is None else paired.ratio.value - 1.0
+    if paired.p_value is None or paired.p_value >= SURE or change is None or abs(change) < SLIGHT:
+        return "open"
+    return "better" if change < 0.0 else "worse"

@@ -74,7 +74,7 @@ def test_a_pair_is_the_same_seed() -> None:
     rows += [row(seed, 0.05 * seed, law="pidnn") for seed in (4, 3, 2, 1)]
     (found,) = summarize(rows, ["law"], ["law"]).comparisons
     assert (found.key, found.first, found.second, found.labels, found.pairs) == ("law", "pid", "pidnn", {}, 4)
-    assert found.measures["position_m"].ratio == pytest.approx(0.5)
+    assert found.measures["position_m"].ratio.value == pytest.approx(0.5)
     assert found.measures["position_m"].difference.value == pytest.approx(-0.125)
     assert found.measures["position_m"].p_value == pytest.approx(2 / 16)  # all of one sign: 2 of 2^4 patterns
     assert found.measures["effort_rad_s"].p_value == 1.0
@@ -109,4 +109,4 @@ def test_each_further_value_is_compared_with_the_first_in_each_other_cell() -> N
 
 def test_wilcoxon_leaves_equal_pairs_out() -> None:
     assert paired([(1.0, 1.0), (2.0, 2.0)]).p_value == 1.0
-    assert paired([(0.0, 1.0)]).ratio is None
+    assert paired([(0.0, 1.0)]).ratio.value is None

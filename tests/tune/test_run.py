@@ -15,8 +15,8 @@ from mavsitl.campaign import workers
 from mavsitl.campaign.fly import Row, fly
 from mavsitl.campaign.grid import Case, case
 from mavsitl.campaign.store import Journal
+from mavsitl.report.tune import render
 from mavsitl.tune import flights, result, run
-from mavsitl.tune.page import render
 
 KEYS = ("controller.position.k_p_per_s2=2:40", "controller.learning.rate=1:100:log")
 SHORT: dict[str, Any] = {"duration_s": 1.0}

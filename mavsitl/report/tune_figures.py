@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mavsitl.report.figures import Drawing, draw_svg
+from mavsitl.report.figures import Drawing, svg
 from mavsitl.tune.objective import front
 from mavsitl.tune.run import Tuning
 
@@ -56,9 +56,7 @@ def trade_off(tuning: Tuning) -> Drawing:
         figure.legend(*axes.get_legend_handles_labels(), loc="upper right", ncols=5, borderaxespad=0.2)
 
     said = f"; {lost} lost a flight and are not shown" if lost else ""
-    return Drawing(
-        draw_svg(draw, 4.4, "trade-off"), f"Error against effort of all {len(tuning.trials)} tried{said}", ""
-    )
+    return Drawing(svg(draw, 4.4, "trade-off"), f"Error against effort of all {len(tuning.trials)} tried{said}", "")
 
 
 def convergence(tuning: Tuning) -> Drawing:
@@ -89,7 +87,7 @@ def convergence(tuning: Tuning) -> Drawing:
         figure.legend(*rows[0].get_legend_handles_labels(), loc="upper right", ncols=2, borderaxespad=0.2)
 
     said = "; red lines: a flight was lost" if not flown.all() else ""
-    return Drawing(draw_svg(draw, 4.4, "convergence"), f"The search, evaluation by evaluation{said}", "")
+    return Drawing(svg(draw, 4.4, "convergence"), f"The search, evaluation by evaluation{said}", "")
 
 
 def _axes(figure: Figure, rows: int) -> list[Axes]:
