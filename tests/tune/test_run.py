@@ -21,8 +21,8 @@ from mavsitl.tune import flights, result, run
 KEYS = ("controller.position.k_p_per_s2=2:40", "controller.learning.rate=1:100:log")
 SHORT: dict[str, Any] = {"duration_s": 1.0}
 ARGUMENTS = (
-    "tune", "hover-wind", "spiral-calm", "--duration", "1", "--search-duration", "0.5", "--seeds", "1001,", "--held-out",
-    "2", "--evaluations", "4", "--jobs", "1", *(part for key in KEYS for part in ("--tune", key)),
+    "tune", "hover-wind", "spiral-calm", "--duration", "1", "--search-duration", "0.5", "--seeds", "1001,",
+    "--held-out", "2", "--evaluations", "4", "--jobs", "1", *(part for key in KEYS for part in ("--tune", key)),
 )  # fmt: skip
 
 
