@@ -88,8 +88,8 @@ Search the gains and learning rates of a controller over whole flights in memory
 under the same few seeds; what is found is then judged against the start on seeds that the search has not seen. Without
 a scenario the paper's four experiments are flown together.
 
-  error      mean over scenarios, states and seeds of RMSE over the paper's number in Tables 3 and 4; in a scenario that
-             is none of the paper's over 0.1 m and 0.5 degrees
+  error      of each scenario and state the RMSE over the paper's number in Tables 3 and 4, or in a scenario that is
+             none of the paper's over 0.1 m and 0.5 degrees; of these ratios the 4-norm: the worst count most
   effort     RMS of the rotors' speeds about their mean, rad/s
   searched   the least error x effort^W, W being --effort-weight; a lost flight is worse than any that was flown
 

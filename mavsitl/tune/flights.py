@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import msgspec
 
@@ -13,7 +13,7 @@ from mavsitl.campaign.grid import Case, case
 from mavsitl.campaign.store import Journal
 from mavsitl.campaign.workers import Workers, fly_all
 from mavsitl.scenario import Flight, load
-from mavsitl.tune.objective import Score, scale, score
+from mavsitl.tune.objective import Score, Six, scale, score
 from mavsitl.tune.space import Overrides, Space
 
 FlyAll: TypeAlias = Callable[[Sequence[Case]], Iterator[Row]]
@@ -49,6 +49,8 @@ class Flights:
     seeds: tuple[int, ...]
     duration_s: float | None = None
     """So much of each flight at most; None: as long as its scenario says."""
+    factors: tuple[Six, ...] | None = None
+    """A scenario each, by which its scale is multiplied: what a part of a flight shows of the whole; None: 1."""
 
     @property
     def each(self) -> int:
@@ -61,13 +63,16 @@ class Flights:
 
     def scores(self, candidates: Sequence[tuple[float, ...]], fly_all: FlyAll) -> list[Score]:
         """In their order."""
-        scales, durations_s = [], []
+        factors = self.factors or ((1.0,) * 6,) * len(self.names)
+        scales: list[Any] = []
+        durations_s = []
         grid: list[list[list[Case]]] = []
         for values in candidates:
             grid.append([])
-            for name in self.names:
+            for name, factor in zip(self.names, factors, strict=True):
                 flight = self.flight(name, values)
-                scales.append(scale(flight.scenario))  # of the whole flight, however much of it is flown
+                whole = scale(flight.scenario)
+                scales.append(tuple(a * b for a, b in zip(whole, factor, strict=True)))
                 flight = self._shortened(flight)
                 durations_s.append(flight.scenario.duration_s)
                 grid[-1].append([case(flight, seed) for seed in self.seeds])

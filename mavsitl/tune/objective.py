@@ -25,6 +25,9 @@ class TuneError(CampaignError):
 SCALE: Six = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)
 """By what the RMSE of a flight that is none of the paper's is divided: m and degrees."""
 
+NORM = 4
+"""The power whose mean over scenarios and states is taken: the worst numbers count most, and smoothly."""
+
 _WORST_ERROR = 13.0
 _WORST_EFFORT = 12.0
 """Above the logarithms of any flown flight's error (20 m over the paper's least number) and effort / (rad/s)."""
@@ -41,7 +44,9 @@ class Score:
     """One set of gains over scenarios and seeds."""
 
     errors: tuple[float, ...]
-    """A seed each: the mean over scenarios and states of RMSE over its scale; infinite where a flight was lost."""
+    """A seed each: `NORM`-th root of the mean over scenarios and states of (RMSE / scale) ** `NORM`; infinite where a
+    flight was lost.
+    """
     efforts: tuple[float, ...]
     """A seed each: the mean over scenarios of the rotors' effort, rad/s (`Row.effort_rad_s`)."""
     unflown: float
@@ -92,16 +97,17 @@ def score(rows: Sequence[Sequence[Row]], scales: Sequence[Six], durations_s: Seq
     ]
     relative = rmse / np.array(scales)[:, np.newaxis, :]
     return Score(
-        errors=tuple(relative.mean(axis=(0, 2)).tolist()),
+        errors=tuple(np.power(np.power(relative, NORM).mean(axis=(0, 2)), 1.0 / NORM).tolist()),
         efforts=tuple(efforts.mean(axis=0).tolist()),
         unflown=1.0 - float(np.mean(flown)),
         lost=len(bad),
-        rmse=tuple(_six(each) for each in np.sqrt(squares.mean(axis=1))),
+        rmse=tuple(six(each) for each in np.sqrt(squares.mean(axis=1))),
         message=f"{bad[0].scenario}, seed {bad[0].seed}: {bad[0].message}" if bad else "",
     )
 
 
-def _six(values: Floats) -> Six:
+def six(values: Floats) -> Six:
+    """Of (6,)."""
     x, y, z, phi, theta, psi = values.tolist()
     return x, y, z, phi, theta, psi
 

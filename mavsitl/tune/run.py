@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from mavsitl.campaign.errors import GridError
 from mavsitl.tune.flights import Flights, FlyAll
-from mavsitl.tune.objective import Score
+from mavsitl.tune.objective import Score, six
 from mavsitl.tune.paired import Paired, paired
 from mavsitl.tune.search import Trial, search
 from mavsitl.tune.space import Overrides, Space, space
@@ -88,12 +90,31 @@ def held_out(tuning: Tuning) -> Flights:
 
 def flights_of(tuning: Tuning) -> int:
     """How many there are to fly in all, at most."""
-    return searched(tuning).each * tuning.plan.evaluations + 2 * held_out(tuning).each
+    extra = 2 if tuning.plan.search_duration_s else 0
+    return searched(tuning).each * (tuning.plan.evaluations + extra) + 2 * held_out(tuning).each
+
+
+def calibrated(tuning: Tuning, fly_all: FlyAll) -> Flights:
+    """What a candidate flies in the search, with scales for a part of each flight.
+
+    A start from rest is a larger part of a short flight than of the whole. So the numbers that a part is measured by
+    are those of the whole, times what the start has in the part over what it has in the whole. Where the start is lost
+    there is nothing to correct by.
+    """
+    part = searched(tuning)
+    if part.duration_s is None:
+        return part
+    whole = replace(part, duration_s=None)
+    (short,), (long,) = (flights.scores([tuning.space.start], fly_all) for flights in (part, whole))
+    if short.lost or long.lost:
+        return part
+    pairs = zip(short.rmse, long.rmse, strict=True)
+    return replace(part, factors=tuple(six(a / np.where(b > 0.0, b, a)) for a, b in map(np.array, pairs)))
 
 
 def carry_out(tuning: Tuning, fly_all: FlyAll, said: Callable[[Trial], None]) -> None:
     """Search and judge; what is in `tuning` when it is interrupted is good. `said` is told of each trial."""
-    plan, flights = tuning.plan, searched(tuning)
+    plan, flights = tuning.plan, calibrated(tuning, fly_all)
 
     def evaluate(values: tuple[float, ...]) -> Score:
         return flights.scores([values], fly_all)[0]

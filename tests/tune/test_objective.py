@@ -29,13 +29,13 @@ def test_the_papers_scenarios_are_weighed_by_its_tables_and_others_by_a_fixed_sc
     assert scale(scenario.load("hover-gust").scenario) == SCALE
 
 
-def test_a_score_is_the_mean_of_ratios_with_a_number_a_seed() -> None:
+def test_a_score_has_a_number_a_seed_in_which_the_worst_ratio_counts_most() -> None:
     found = score([[row(1.0), row(3.0)], [row(2.0), row(2.0, 30.0)]], [ONES, (2.0,) * 6], [60.0, 60.0])
-    assert found.errors == (1.0, 2.0)
+    assert found.errors == pytest.approx((1.0, ((3.0**4 + 1.0) / 2.0) ** 0.25))
     assert found.efforts == (10.0, 20.0)
-    assert (found.error, found.effort, found.lost) == (1.5, 15.0, 0)
+    assert (found.effort, found.lost) == (15.0, 0)
     assert found.rmse[0][0] == pytest.approx(5.0**0.5)
-    assert found.objective(0.5) == pytest.approx(log(1.5) + 0.5 * log(15.0))
+    assert found.objective(0.5) == pytest.approx(log(sum(found.errors) / 2.0) + 0.5 * log(15.0))
 
 
 @given(flown=st.floats(1e-6, 1e4), effort=st.floats(1e-3, 1e5), weight=st.floats(0.0, 5.0), time_s=st.floats(0.0, 60.0))

@@ -77,7 +77,7 @@ def test_the_command_leaves_scenarios_that_fly_with_what_was_found(
     rows = (tmp_path / "run" / "rows.jsonl").read_text("utf-8").splitlines()
     candidates, judged = 4, 1 if record["chosen"] == 0 else 2
     assert len(record["trials"]) == candidates
-    assert len(rows) == 2 * candidates + 2 * 2 * judged
+    assert len(rows) == 2 * (candidates + 1) + 2 * 2 * judged  # and the start's whole flights, to measure by
 
 
 def test_the_same_command_gives_the_same_and_goes_on_after_a_kill(
@@ -113,6 +113,7 @@ def test_a_flight_that_is_kept_is_not_flown_again(tmp_path: Path) -> None:
         run.carry_out(again, flights.kept(journal, Nobody(), lambda: told.append(None)), lambda trial: None)
     assert again == tuning
     assert len(told) == run.flights_of(tuning)
+    assert len(told) == 4 + 2 * 2
 
 
 def test_ctrl_c_gives_the_best_so_far(
@@ -123,7 +124,7 @@ def test_ctrl_c_gives_the_best_so_far(
     def interrupted(cases: Sequence[Case], crew: workers.Workers) -> Iterator[Row]:
         for row in real(cases, crew):
             flown.append(row)
-            if len(flown) == 5:
+            if len(flown) == 7:
                 raise KeyboardInterrupt
             yield row
 
@@ -172,9 +173,17 @@ def test_held_out_flights_are_whole_and_on_seeds_that_were_not_searched() -> Non
 
     run.carry_out(tuning, fly_all, lambda trial: None)
     assert {(each.seed, each.flight.scenario.duration_s) for each in seen} == {
-        *((seed, 0.5) for seed in (1001, 1002)),
+        *((seed, length) for seed in (1001, 1002) for length in (0.5, 1.0)),  # the start's whole flight is the measure
         *((seed, 1.0) for seed in (1, 2, 3)),
     }
+
+
+def test_a_part_of_a_flight_is_measured_as_the_whole_would_be() -> None:
+    """The spiral begins a metre beside its path, which weighs more in a shorter flight."""
+    whole = carried_out(plan(names=("spiral-calm",), settings={"duration_s": 4.0}, evaluations=1))
+    part = carried_out(plan(names=("spiral-calm",), settings={"duration_s": 4.0}, evaluations=1, search_duration_s=2.0))
+    assert part.start.score.rmse[0][1] > 1.3 * whole.start.score.rmse[0][1]
+    assert part.start.score.error == pytest.approx(whole.start.score.error)
 
 
 def test_a_file_of_ones_own_keeps_its_airframe_and_waypoints(tmp_path: Path) -> None:
