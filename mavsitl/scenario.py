@@ -515,7 +515,8 @@ def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
     """Read a shipped scenario by name, or a file by path.
 
     `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``; through an array of tables they go by the index,
-    ``wind[0].altitude_m``, or without it where there is one alone. Raises `ScenarioError`.
+    ``wind[0].altitude_m``, or without it where there is one alone. What stands beside a key in a table that the file
+    leaves out keeps its default. Raises `ScenarioError`.
     """
     text, where, folder = _read("scenarios", name_or_path, names())
     data = _parse(text, where)
@@ -578,6 +579,7 @@ def _override(data: dict[str, Any], key: str, value: Any, where: str) -> None:
     *parents, last = key.split(".")
     table = data
     path = ""
+    default: Any = Scenario(title="")
     for parent in parents:
         step = _STEP.fullmatch(parent)
         if step is None:
@@ -586,7 +588,8 @@ def _override(data: dict[str, Any], key: str, value: Any, where: str) -> None:
             )
         name, index = step[1], step[2]
         path = _join(path, name)
-        table = table.setdefault(name, {})
+        default = getattr(default, name, None)
+        table = table.setdefault(name, _whole(default))
         if isinstance(table, list):
             table = _element(table, index, path, key, where)
             path += f"[{index or 0}]"
@@ -595,6 +598,14 @@ def _override(data: dict[str, Any], key: str, value: Any, where: str) -> None:
         if not isinstance(table, dict):
             raise ScenarioError(f"{where}: {key}: '{path}' is not a table, so it has no key to set")
     table[last] = value
+
+
+def _whole(default: Any) -> dict[str, Any]:
+    """A table to set one key in: its default where it is one that must be given whole, as `Gains`."""
+    if isinstance(default, Section) and any(field.required for field in msgspec.structs.fields(default)):
+        table: dict[str, Any] = msgspec.to_builtins(default)
+        return table
+    return {}
 
 
 def _element(array: list[Any], index: str | None, path: str, key: str, where: str) -> Any:
