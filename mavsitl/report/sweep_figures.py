@@ -48,8 +48,10 @@ def distribution(rows: Sequence[Row], summary: Summary, keys: Sequence[str], nam
                       markeredgewidth=0.0, zorder=2)  # fmt: skip
             _mark(axes, spread.median, place, colour)
             if gone := cell.lost + cell.failed:
-                axes.annotate(f"{gone} not flown to the end", (1.0, place), xycoords=("axes fraction", "data"), color=BROKEN,
-                              ha="right", va="center", fontsize=8.0)  # fmt: skip
+                axes.annotate(
+                    f"{gone} not flown to the end", (1.0, place), xycoords=("axes fraction", "data"),
+                    color=BROKEN, ha="right", va="center", fontsize=8.0,
+                )  # fmt: skip
         _scale(axes, [value for each in values for value in each], "x")
         axes.set_xlabel(measure.title)
 

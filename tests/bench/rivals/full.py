@@ -107,7 +107,7 @@ class Dryden:
     """Eqs 14-17: three first-order filters of white noise, discretised exactly."""
 
     def __init__(self, wind: DrydenPaper, h: float, rng: np.random.Generator) -> None:
-        height, speed = wind.altitude_m, wind.wind_speed_20ft_m_s
+        height, speed = wind.altitude_m, wind.speed_20ft_m_s
         base = 0.177 + 0.000823 * height
         length = np.array([height / base**1.2, height / base**1.2 / 2.0, height / 2.0])
         sigma_w = 0.1 * speed
