@@ -104,10 +104,9 @@ def test_a_control_period_of_a_fleet_is_each_vehicle_s_own(n: int) -> None:
     sensor_normals = rng.standard_normal((periods, substeps * tick.GYRO_NORMALS + tick.MEASURE_NORMALS, n))
 
     def fly(columns: slice) -> Array:
-        x, wind, command, plant, state, asked, rotors, held = (
-            array[..., columns].copy()
-            for array in (fleet.x, fleet.wind, fleet.command, fleet.parameters, field.state, demand, motors, fleet.held)
-        )
+        arrays = fleet.x, fleet.wind, fleet.command, fleet.parameters, field.state, demand, motors
+        x, wind, command, plant, state, asked, rotors = (array[:, columns].copy() for array in arrays)
+        held = fleet.held[columns].copy()
         estimate, inner = np.zeros((tick.ESTIMATE_ROWS, x.shape[1])), np.zeros((tick.INNER_ROWS, x.shape[1]))
         for k in range(periods):
             tick.advance(
