@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,6 +18,7 @@ from mavsitl_vehicle.plant.state import N_STATES, Array
 from mavsitl_vehicle.plant.step import rk4_step
 from mavsitl_vehicle.wind.field import WindField
 
+from mavsitl.compiled import JIT
 from mavsitl.scenario import DrydenPaper, Offnominal
 from tests.plant.flight import PAPER, REALISTIC, Fleet
 
@@ -120,3 +124,14 @@ def test_a_control_period_of_a_fleet_is_each_vehicle_s_own(n: int) -> None:
     assert np.isfinite(together).all()
     for j in range(n):
         assert fly(slice(j, j + 1))[:, 0].tobytes() == together[:, j].tobytes()
+
+
+@pytest.mark.skipif(not JIT, reason="un-jitted, nothing is compiled")
+def test_the_loops_over_the_lanes_are_vectors() -> None:
+    """The compiler says nothing when it gives up: every square root of both loops is one of a vector."""
+    fresh = numba.njit(error_model="numpy")(rk4_step.py_func)  # type: ignore[attr-defined]
+    fleet = fleet_of(1, LANES, 0.0)
+    fresh(fleet.x, fleet.command, fleet.wind, fleet.parameters, 1.0e-3, fleet.held, scratch(LANES))
+    (code,) = fresh.inspect_llvm().values()
+    in_the_air, legs, stages = 1, 4, 4
+    assert len(re.findall(r"call <\d+ x double> @llvm\.sqrt", code)) >= in_the_air + (1 + legs * stages)
