@@ -10,7 +10,8 @@ from mavsitl_vehicle.plant.state import Array
 from tests.plant.flight import PAPER, REALISTIC, Fleet
 
 STEPS = 40
-N = 16
+N = 37
+"""Two blocks of lanes and five vehicles that are stepped alone."""
 
 
 def fly(columns: slice) -> Array:

@@ -188,22 +188,6 @@ def stepped_lane(block: Array, dt_s: float, lane: int, on_ground: bool) -> tuple
     )
 
 
-@inlined
-def step_lanes(block: Array, dt_s: float) -> None:
-    """Steps a block: first as if all were in the air, and, if any was not, again."""
-    touching = 0.0
-    for lane in range(LANES):
-        body, rotors, touches = stepped_lane(block, dt_s, lane, False)
-        lanes.put_after(block, lane, body, rotors)
-        block[lanes.TOUCHES * LANES + lane] = 1.0 if touches else 0.0
-    for lane in range(LANES):
-        touching += block[lanes.TOUCHES * LANES + lane]
-    if touching > 0.0:
-        for lane in range(LANES):
-            body, rotors, _ = stepped_lane(block, dt_s, lane, True)
-            lanes.put_after(block, lane, body, rotors)
-
-
 @compiled
 def rk4_step(
     x: Array,
@@ -229,7 +213,18 @@ def rk4_step(
         lanes.gather(block, lanes.PARAMETERS, N_PARAMETERS, parameters, first)
         for lane in range(LANES):
             block[lanes.HELD * LANES + lane] = 1.0 if held[first + lane] else 0.0
-        step_lanes(block, dt_s)
+        # First as if all were in the air, and, if any was not, again.
+        for lane in range(LANES):
+            body, rotors, touches = stepped_lane(block, dt_s, lane, False)
+            lanes.put_after(block, lane, body, rotors)
+            block[lanes.TOUCHES * LANES + lane] = 1.0 if touches else 0.0
+        touching = 0.0
+        for lane in range(LANES):
+            touching += block[lanes.TOUCHES * LANES + lane]
+        if touching > 0.0:
+            for lane in range(LANES):
+                body, rotors, _ = stepped_lane(block, dt_s, lane, True)
+                lanes.put_after(block, lane, body, rotors)
         lanes.scatter(block, lanes.AFTER, N_STATES, x, first)
     for j in range(alone, n):
         body, rotors, _ = stepped(
