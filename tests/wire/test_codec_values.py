@@ -119,13 +119,13 @@ def test_packer_takes_byte_arrays_as_bytes_or_integers() -> None:
 
 def test_packer_takes_a_long_array_as_the_bytes_of_the_wire() -> None:
     pack = packer(mavlink.MAVLink_odometry_message)
+    before = (123, 1, 12, 1.0, 2.0, 3.0, (1.0, 0.0, 0.0, 0.0), *(0.5,) * 6)
     pose, velocity = [0.25 * k for k in range(21)], [math.nan] * 21
-    whole = (123, 1, 12, 1.0, 2.0, 3.0, (1.0, 0.0, 0.0, 0.0), *(0.5,) * 6, pose, velocity, 1, 2, 90)
-    packed = [struct.pack("<21f", *field) if field in (pose, velocity) else field for field in whole]
-    assert pack(7, 1, 1, *packed) == pack(7, 1, 1, *whole)
-    for wrong in (packed[13][:-1], packed[13] + b"\0", b""):
+    octets, others = struct.pack("<21f", *pose), struct.pack("<21f", *velocity)
+    assert pack(7, 1, 1, *before, octets, others, 1, 2, 90) == pack(7, 1, 1, *before, pose, velocity, 1, 2, 90)
+    for wrong in (octets[:-1], octets + b"\0", b""):
         with pytest.raises(EncodeError, match="pose_covariance needs exactly 84 bytes"):
-            pack(7, 1, 1, *packed[:13], wrong, *packed[14:])
+            pack(7, 1, 1, *before, wrong, others, 1, 2, 90)
 
 
 UNFIT = [
