@@ -71,12 +71,35 @@ _LONG_ARRAY = 8
 """Arrays with more elements are packed and unpacked as one block; element by element is faster below."""
 
 _crc = crc16.mcrf4xx
-# The checksum leaves the magic byte out. Begun in the one state that the magic byte turns into the real initial state,
-# it can run over the frame from its first byte, which saves a copy.
-_CRC_BEFORE_V2 = next(state for state in range(0x10000) if _crc(bytes((_MAGIC_V2,)), state) == 0xFFFF)
-_CRC_BEFORE_V1 = next(state for state in range(0x10000) if _crc(bytes((_MAGIC_V1,)), state) == 0xFFFF)
 # One more byte, a message's CRC_EXTRA, without a call: ``crc >> 8 ^ _CRC_TABLE[(crc ^ extra) & 0xFF]``.
 _CRC_TABLE = tuple(_crc(bytes((octet,)), 0) for octet in range(0x100))
+_CRC_INDEX = {value >> 8: octet for octet, value in enumerate(_CRC_TABLE)}
+
+
+def _state_before(octet: int, crc: int) -> int:
+    """The one state that this byte turns into `crc`: the high bytes of the table are all different."""
+    index = _CRC_INDEX[crc >> 8]
+    return ((crc ^ _CRC_TABLE[index]) & 0xFF) << 8 | (index ^ octet)
+
+
+def _residue(checksum: int, extra: int) -> int:
+    """The state in which the CRC over a good frame ends that goes on over the checksum itself.
+
+    CRC_EXTRA is taken in before the checksum and stands nowhere in the frame, so the residue is not the usual zero. The
+    checksum and CRC_EXTRA alone decide it, and a frame with another checksum than it should have leaves another.
+    """
+    return _crc(checksum.to_bytes(2, "little"), _state_before(extra, checksum))
+
+
+# The checksum leaves the magic byte out. Begun in the one state that the magic byte turns into the real initial state,
+# it can run over the frame from its first byte, which saves a copy.
+_CRC_BEFORE_V2 = _state_before(_MAGIC_V2, 0xFFFF)
+_CRC_BEFORE_V1 = _state_before(_MAGIC_V1, 0xFFFF)
+# A CRC is linear, so a residue is the exclusive or of what each byte of the checksum and CRC_EXTRA contribute. With it
+# a frame is checked by one call, and no copy of it without the checksum is made.
+_RESIDUE_LOW = tuple(_residue(low, 0) ^ _residue(0, 0) for low in range(0x100))
+_RESIDUE_HIGH = tuple(_residue(high << 8, 0) ^ _residue(0, 0) for high in range(0x100))
+
 _STARTS = tuple(bytes((_MAGIC_V2, length)) for length in range(0x100))
 """The first two bytes of a frame, by the length of its payload."""
 
@@ -613,13 +636,13 @@ def reader(message_class: MessageClass, *fieldnames: str) -> Reader:
 class _Kind:
     """What has to be known of a message class to check and read its frames."""
 
-    __slots__ = ("decode", "extra", "message_class", "message_id", "target_component", "target_system")
+    __slots__ = ("decode", "message_class", "message_id", "residue", "target_component", "target_system")
 
     def __init__(self, message_class: MessageClass) -> None:
         offsets = {field.name: field.offset for field in _fields(message_class)}
         self.message_class = message_class
         self.message_id: int = message_class.id
-        self.extra: int = message_class.crc_extra
+        self.residue = _residue(0, message_class.crc_extra)
         self.target_system = offsets.get("target_system", _NOWHERE)
         self.target_component = offsets.get("target_component", _NOWHERE)
         self.decode: Callable[[bytes], Message] = self._first
@@ -677,8 +700,8 @@ def parse(datagram: bytes, counters: Counters | None = None, max_bytes: int = MA
         id_bytes = datagram[7:10]
         if id_bytes in _kinds:
             kind = _kinds[id_bytes]
-            crc = _crc(datagram[:-_CRC_BYTES], _CRC_BEFORE_V2)
-            if datagram[-2] | datagram[-1] << 8 == crc >> 8 ^ _CRC_TABLE[(crc ^ kind.extra) & 0xFF]:
+            residue = _RESIDUE_LOW[datagram[-2]] ^ _RESIDUE_HIGH[datagram[-1]] ^ kind.residue
+            if _crc(datagram, _CRC_BEFORE_V2) == residue:
                 frame = Frame()
                 frame._kind = kind
                 frame._message = None
@@ -775,8 +798,8 @@ def _checked(
     if kind is None:
         counters.unknown_id += 1
         return None
-    crc = _crc(datagram[begin:end], before)
-    if datagram[end] | datagram[end + 1] << 8 != crc >> 8 ^ _CRC_TABLE[(crc ^ kind.extra) & 0xFF]:
+    residue = _RESIDUE_LOW[datagram[end]] ^ _RESIDUE_HIGH[datagram[end + 1]] ^ kind.residue
+    if _crc(datagram[begin : end + _CRC_BYTES], before) != residue:
         counters.bad_crc += 1
         return None
     frame = Frame()

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +14,8 @@ import pytest
 from mavsitl.compiled import JIT
 from tests.guard import counts
 from tests.guard.counter import InstructionCounter
+
+ROOT = Path(__file__).resolve().parents[2]
 
 jitted = pytest.mark.skipif(not JIT, reason="un-jitted kernels are Python, and not what the budget counts")
 
@@ -49,6 +52,7 @@ def test_the_counts_are_the_same_again(found: counts.Counts) -> None:
     )
     again = subprocess.run(
         [sys.executable, "-c", script],
+        cwd=ROOT,
         env=os.environ | {"PYTHONHASHSEED": "77"},
         stdout=subprocess.PIPE,
         check=True,

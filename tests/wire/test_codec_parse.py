@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from fastcrc import crc16
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -94,6 +95,18 @@ def test_the_short_way_finds_what_the_search_finds(wire: bytes, changes: int, da
     assert [(frame.raw, frame.message_id, *address_of(frame)) for frame in found] == [
         (frame.raw, frame.message_id, *address_of(frame)) for frame in searched
     ]
+
+
+def test_the_residue_is_that_of_the_right_checksum_and_of_no_other() -> None:
+    """For every state that a frame may leave before its CRC_EXTRA; a checksum is two bytes taken in one by one."""
+    for extra in (0, 1, 50, 254, 255):
+        residues = set()
+        for state in range(0x10000):
+            low, high = checksum = crc16.mcrf4xx(bytes((extra,)), state).to_bytes(2, "little")
+            found = crc16.mcrf4xx(checksum, state)
+            assert found == codec._RESIDUE_LOW[low] ^ codec._RESIDUE_HIGH[high] ^ codec._residue(0, extra)
+            residues.add(crc16.mcrf4xx(b"\x12\x34", state))
+        assert len(residues) == 0x10000
 
 
 def test_an_unfinished_frame_eats_nothing() -> None:

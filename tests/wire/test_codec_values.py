@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -114,6 +115,17 @@ def test_packer_takes_byte_arrays_as_bytes_or_integers() -> None:
     pack = packer(mavlink.MAVLink_file_transfer_protocol_message)
     payload = bytes(range(251))
     assert pack(0, 1, 1, 0, 1, 1, payload) == pack(0, 1, 1, 0, 1, 1, list(payload))
+
+
+def test_packer_takes_a_long_array_as_the_bytes_of_the_wire() -> None:
+    pack = packer(mavlink.MAVLink_odometry_message)
+    before = (123, 1, 12, 1.0, 2.0, 3.0, (1.0, 0.0, 0.0, 0.0), *(0.5,) * 6)
+    pose, velocity = [0.25 * k for k in range(21)], [math.nan] * 21
+    octets, others = struct.pack("<21f", *pose), struct.pack("<21f", *velocity)
+    assert pack(7, 1, 1, *before, octets, others, 1, 2, 90) == pack(7, 1, 1, *before, pose, velocity, 1, 2, 90)
+    for wrong in (octets[:-1], octets + b"\0", b""):
+        with pytest.raises(EncodeError, match="pose_covariance needs exactly 84 bytes"):
+            pack(7, 1, 1, *before, wrong, others, 1, 2, 90)
 
 
 UNFIT = [
