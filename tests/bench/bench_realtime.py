@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -27,7 +28,8 @@ from mavsitl.realtime import RealTimeError, Wish
 from tests.bench.bench_latency import idle
 from tests.bench.live import installed, live
 
-BURNER = "while True: pass"
+BURNER = "import os; parent = os.getppid()\nwhile os.getppid() == parent: sum(range(1_000_000))"
+"""It computes, and outlives this process by milliseconds at most."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,11 @@ class Kept:
 
 
 @contextmanager
-def burners(number: int) -> Iterator[None]:
+def burners(number: int) -> Iterator[list[subprocess.Popen[bytes]]]:
     """So many processes that compute, ended with the context."""
     burning = [subprocess.Popen([sys.executable, "-S", "-c", BURNER]) for _ in range(number)]
     try:
-        yield
+        yield burning
     finally:
         for each in burning:
             each.kill()
@@ -115,6 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=3, metavar="N", help="rounds (default: 3)")
     parser.add_argument("--json", action="store_true", help="print every flight as JSON, no table")
     options = parser.parse_args(argv)
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # what was started is ended
     plan = rows()
     found: dict[str, list[Kept]] = {name: [] for name in plan}
     with installed() as environment:
