@@ -63,7 +63,7 @@ def states(rng: np.random.Generator) -> Iterator[Observer]:
     """The same as states, with a true wind from the second on."""
     seen = Observer()
     for stamp_us, values in telemetry(rng):
-        assert observer.take_odometry(*values, False, True, seen.state)
+        assert observer.take_odometry(*values, in_body=False, newer=True, state=seen.state)
         seen.stamp_us = stamp_us
         yield seen
         seen.state["true_wind"][0, :, 0] = rng.normal(size=3)
@@ -96,7 +96,7 @@ def digests() -> dict[str, str]:
     for _, values in telemetry(rng):
         x, y, z, q, vx, vy, vz, *rates = values
         for in_body in (False, True):
-            good = observer.take_odometry(*values, in_body, True, seen.state)
+            good = observer.take_odometry(*values, in_body=in_body, newer=True, state=seen.state)
             add("odometry", good, *(seen.state[name] for name in ("position", "velocity", "quaternion", "angle_rates")))
         w_x, w_y, w_z = rates
         good = observer.take_attitude(q, w_x, w_y, w_z, True, seen.state)
