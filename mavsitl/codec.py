@@ -71,16 +71,41 @@ _LONG_ARRAY = 8
 """Arrays with more elements are packed and unpacked as one block; element by element is faster below."""
 
 _crc = crc16.mcrf4xx
-# The checksum leaves the magic byte out. Begun in the one state that the magic byte turns into the real initial state,
-# it can run over the frame from its first byte, which saves a copy.
-_CRC_BEFORE_V2 = next(state for state in range(0x10000) if _crc(bytes((_MAGIC_V2,)), state) == 0xFFFF)
-_CRC_BEFORE_V1 = next(state for state in range(0x10000) if _crc(bytes((_MAGIC_V1,)), state) == 0xFFFF)
 # One more byte, a message's CRC_EXTRA, without a call: ``crc >> 8 ^ _CRC_TABLE[(crc ^ extra) & 0xFF]``.
 _CRC_TABLE = tuple(_crc(bytes((octet,)), 0) for octet in range(0x100))
+_CRC_INDEX = {value >> 8: octet for octet, value in enumerate(_CRC_TABLE)}
+
+
+def _state_before(octet: int, crc: int) -> int:
+    """The one state that this byte turns into `crc`: the high bytes of the table are all different."""
+    index = _CRC_INDEX[crc >> 8]
+    return ((crc ^ _CRC_TABLE[index]) & 0xFF) << 8 | (index ^ octet)
+
+
+def _residue(checksum: int, extra: int) -> int:
+    """The state in which the CRC over a good frame ends that goes on over the checksum itself.
+
+    CRC_EXTRA is taken in before the checksum and stands nowhere in the frame, so the residue is not the usual zero. The
+    checksum and CRC_EXTRA alone decide it, and a frame with another checksum than it should have leaves another.
+    """
+    return _crc(checksum.to_bytes(2, "little"), _state_before(extra, checksum))
+
+
+# The checksum leaves the magic byte out. Begun in the one state that the magic byte turns into the real initial state,
+# it can run over the frame from its first byte, which saves a copy.
+_CRC_BEFORE_V2 = _state_before(_MAGIC_V2, 0xFFFF)
+_CRC_BEFORE_V1 = _state_before(_MAGIC_V1, 0xFFFF)
+# A CRC is linear, so a residue is the exclusive or of what each byte of the checksum and CRC_EXTRA contribute. With it
+# a frame is checked by one call, and no copy of it without the checksum is made.
+_RESIDUE_LOW = tuple(_residue(low, 0) ^ _residue(0, 0) for low in range(0x100))
+_RESIDUE_HIGH = tuple(_residue(high << 8, 0) ^ _residue(0, 0) for high in range(0x100))
+
 _STARTS = tuple(bytes((_MAGIC_V2, length)) for length in range(0x100))
 """The first two bytes of a frame, by the length of its payload."""
 
-_HEADER_LAYOUT = "<BBxxBBB3s"
+_HEADER_LAYOUT = "<2sxxBBB3s"
+_NOWHERE = 0x100  # an offset that no payload reaches
+_EVERYBODY = (0, 0)
 _write_crc = struct.Struct("<H").pack
 _new = object.__new__
 
@@ -132,6 +157,8 @@ class Frame:
     def target(self) -> tuple[int, int]:
         """Target system and component; 0 is everybody, as it is for a message without these fields."""
         raw, kind = self.raw, self._kind
+        if kind.target_system == _NOWHERE:
+            return _EVERYBODY
         begin = _HEADER_V2_BYTES if raw[0] == _MAGIC_V2 else _HEADER_V1_BYTES
         length = raw[1]
         return (
@@ -266,12 +293,6 @@ def _as_octets(field: str, count: int, value: Any) -> bytes:
     return data
 
 
-def _as_block(field: str, layout: struct.Struct, value: Any) -> bytes:
-    if isinstance(value, bytes):
-        raise ValueError(f"{field} needs exactly {layout.size} bytes")
-    return layout.pack(*value)
-
-
 def _build_writer(message_class: MessageClass, name: str, parameters: str, value_of: Callable[[_Field], str]) -> Packer:
     """A function of `parameters` that writes a frame; `value_of` gives the expression of a field's value.
 
@@ -285,12 +306,12 @@ def _build_writer(message_class: MessageClass, name: str, parameters: str, value
         "_crc": _crc,
         "_table": _CRC_TABLE,
         "_starts": _STARTS,
+        "_start": _STARTS[sum(field.bytes for field in fields)],
         "_id": message_class.id.to_bytes(3, "little"),
         "_len": len,
         "_bytes": bytes,
         "_as_text": _as_text,
         "_as_octets": _as_octets,
-        "_as_block": _as_block,
         "_errors": (struct.error, TypeError, ValueError, OverflowError),
         "_EncodeError": EncodeError,
     }
@@ -298,19 +319,23 @@ def _build_writer(message_class: MessageClass, name: str, parameters: str, value
     values: list[str] = []
     for field in fields:
         value, local = value_of(field), f"_{field.name}"
-        if field.text or field.long:
-            if field.text:
-                fits, convert = f"_len({local}) <= {field.size}", f"_as_text({field.name!r}, {field.size}, {local})"
-            elif field.octets:
-                fits, convert = f"_len({local}) == {field.size}", f"_as_octets({field.name!r}, {field.size}, {local})"
-            else:
-                names[f"_layout_of{local}"] = struct.Struct(f"<{field.layout}")
-                fits = f"_len({local}) == {field.bytes}"
-                convert = f"_as_block({field.name!r}, _layout_of{local}, {local})"
+        if field.text or field.octets:
+            fits = f"_len({local}) {'<=' if field.text else '=='} {field.size}"
+            convert = "_as_text" if field.text else "_as_octets"
             prepare.append(
                 f"        {local} = {value}\n"
                 f"        if {local}.__class__ is not _bytes or not {fits}:\n"
-                f"            {local} = {convert}\n"
+                f"            {local} = {convert}({field.name!r}, {field.size}, {local})\n"
+            )
+            values.append(local)
+        elif field.long:
+            names[f"_pack{local}"] = struct.Struct(f"<{field.layout}").pack
+            prepare.append(
+                f"        {local} = {value}\n"
+                f"        if {local}.__class__ is not _bytes:\n"
+                f"            {local} = _pack{local}(*{local})\n"
+                f"        elif _len({local}) != {field.bytes}:\n"
+                f"            raise ValueError('{field.name} needs exactly {field.bytes} bytes')\n"
             )
             values.append(local)
         elif field.size > 1:
@@ -324,8 +349,7 @@ def _build_writer(message_class: MessageClass, name: str, parameters: str, value
         f"def {name}({parameters}):\n"
         "    try:\n"
         f"{''.join(prepare)}"
-        f"        _frame = _whole({_MAGIC_V2}, {sum(field.bytes for field in fields)},\n"
-        f"            _sequence, _system_id, _component_id, _id, {', '.join(values)})\n"
+        f"        _frame = _whole(_start, _sequence, _system_id, _component_id, _id, {', '.join(values)})\n"
         "    except _errors as error:\n"
         f"        raise _EncodeError(f'{message_class.msgname}: {{error}}') from error\n"
         "    if not _frame[-1]:\n"
@@ -389,8 +413,9 @@ def encode(message: Message, sequence: int, system_id: int, component_id: int) -
         EncodeError: a field does not fit. Text longer than its field is refused, where pymavlink cuts it.
     """
     message_class = message.__class__
-    function = _encoders.get(message_class)
-    if function is None:
+    try:
+        function = _encoders[message_class]
+    except KeyError:
         function = _encoders[message_class] = _build_encoder(message_class)
     return function(message, sequence, system_id, component_id)
 
@@ -525,7 +550,7 @@ def _begin_reading(fields: list[_Field]) -> tuple[str, dict[str, Any]]:
 def _build_decoder(message_class: MessageClass) -> Callable[[bytes], Message]:
     fields = _fields(message_class)
     short, names = _begin_reading(fields)
-    names |= {"_new": _new, "_class": _received(message_class), "_list": list, "_str": str}
+    names |= {"_new": _new, "_class": _received(message_class), "_list": list}
     targets: list[str] = []
     rest: list[str] = []
     for index, field in enumerate(fields):
@@ -533,9 +558,8 @@ def _build_decoder(message_class: MessageClass) -> Callable[[bytes], Message]:
         if field.text:
             targets.append(local)
             rest.append(f"    message._{field.name}_raw = {local} = {local}.rstrip(b'\\0')\n")
-            rest.append(
-                f"    {attribute} = _str({local}, 'ascii', 'replace') if 0 not in {local} else _as_string({local})\n"
-            )
+            easy = f"{local}.isascii() and 0 not in {local}"
+            rest.append(f"    {attribute} = {local}.decode() if {easy} else _as_string({local})\n")
         elif field.octets:
             targets.append(local)
             rest.append(f"    {attribute} = _list({local})\n")
@@ -609,19 +633,16 @@ def reader(message_class: MessageClass, *fieldnames: str) -> Reader:
     return _build_reader(message_class, fieldnames)
 
 
-_NOWHERE = 0x100  # an offset that no payload reaches
-
-
 class _Kind:
     """What has to be known of a message class to check and read its frames."""
 
-    __slots__ = ("decode", "extra", "message_class", "message_id", "target_component", "target_system")
+    __slots__ = ("decode", "message_class", "message_id", "residue", "target_component", "target_system")
 
     def __init__(self, message_class: MessageClass) -> None:
         offsets = {field.name: field.offset for field in _fields(message_class)}
         self.message_class = message_class
         self.message_id: int = message_class.id
-        self.extra: int = message_class.crc_extra
+        self.residue = _residue(0, message_class.crc_extra)
         self.target_system = offsets.get("target_system", _NOWHERE)
         self.target_component = offsets.get("target_component", _NOWHERE)
         self.decode: Callable[[bytes], Message] = self._first
@@ -676,10 +697,11 @@ def parse(datagram: bytes, counters: Counters | None = None, max_bytes: int = MA
     # Nearly every datagram is one good unsigned MAVLink 2 frame. All others, and what is wrong with them, are left to
     # the search, which would find the same.
     if size > _HEADER_V2_BYTES and datagram[0] == _MAGIC_V2 and datagram[1] + _FRAME_BYTES == size and not datagram[2]:
-        kind = _kinds.get(datagram[7:10])
-        if kind is not None:
-            crc = _crc(datagram[:-_CRC_BYTES], _CRC_BEFORE_V2)
-            if datagram[-2] | datagram[-1] << 8 == crc >> 8 ^ _CRC_TABLE[(crc ^ kind.extra) & 0xFF]:
+        id_bytes = datagram[7:10]
+        if id_bytes in _kinds:
+            kind = _kinds[id_bytes]
+            residue = _RESIDUE_LOW[datagram[-2]] ^ _RESIDUE_HIGH[datagram[-1]] ^ kind.residue
+            if _crc(datagram, _CRC_BEFORE_V2) == residue:
                 frame = Frame()
                 frame._kind = kind
                 frame._message = None
@@ -776,8 +798,8 @@ def _checked(
     if kind is None:
         counters.unknown_id += 1
         return None
-    crc = _crc(datagram[begin:end], before)
-    if datagram[end] | datagram[end + 1] << 8 != crc >> 8 ^ _CRC_TABLE[(crc ^ kind.extra) & 0xFF]:
+    residue = _RESIDUE_LOW[datagram[end]] ^ _RESIDUE_HIGH[datagram[end + 1]] ^ kind.residue
+    if _crc(datagram[begin : end + _CRC_BYTES], before) != residue:
         counters.bad_crc += 1
         return None
     frame = Frame()

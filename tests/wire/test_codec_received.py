@@ -33,13 +33,7 @@ def test_nothing_is_decoded_that_nobody_reads(monkeypatch: pytest.MonkeyPatch) -
     kind.decode = refuse
     monkeypatch.setitem(codec._kinds, WIRE[7:10], kind)
     (frame,) = parse(WIRE)
-    assert (frame.message_id, frame.system_id, frame.component_id, frame.sequence, frame.signed) == (
-        253,
-        42,
-        7,
-        9,
-        False,
-    )
+    assert (frame.message_id, *address_of(frame)) == (253, 42, 7, 9, False)
     assert (frame.raw, frame.payload, frame.target) == (WIRE, WIRE[10:-2], (0, 0))
     assert repr(frame) == f"Frame(STATUSTEXT, {WIRE.hex()})"
     with pytest.raises(AssertionError, match="decoded"):
