@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
+import shlex
 import signal
 import sys
 import tomllib
@@ -12,22 +14,34 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavsitl import __version__
+from mavsitl import __version__, process
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as RichProgress
 
     from mavsitl.ask import Reply, Task
+    from mavsitl.campaign.fly import Row
+    from mavsitl.campaign.store import Journal
+    from mavsitl.campaign.summary import Summary
+    from mavsitl.campaign.sweep import Known, Plan
+    from mavsitl.campaign.workers import Workers
     from mavsitl.check import Heard, PortReport, Report
-    from mavsitl.ends import Outcome
+    from mavsitl.ends import Outcome, VehicleLinks
+    from mavsitl.fleet import FleetOutcome
+    from mavsitl.link.address import Address
+    from mavsitl.realtime import Wish
     from mavsitl.report.run import FlightRecord
     from mavsitl.scenario import Flight
+    from mavsitl.tune.run import Tuning
+    from mavsitl.tune.search import Trial
 
 PAPER_SCENARIOS = ("hover-calm", "hover-wind", "spiral-calm", "spiral-wind")
 
 DEADLINE_S = 10.0
 CHECK_S = 3.0
+MAX_VEHICLES = 250
+"""In one process: system ids end at 255, and ground stations take the highest."""
 SLOWEST_SPEED = 0.5
 """Clients miss a HEARTBEAT after 3 s of wall clock."""
 
@@ -45,6 +59,8 @@ A quadrotor in Dryden wind and an off-board controller, two processes that meet 
   mavsitl link         make the links of a flying vehicle bad, and good again
   mavsitl inject       break a part of a flying vehicle
   mavsitl param        read and set parameters
+  mavsitl sweep        fly a grid of settings and seeds, and compare
+  mavsitl tune         search a controller's gains, and judge them on other seeds
 """
 
 EPILOG = """\
@@ -70,6 +86,37 @@ examples:
   mavsitl fly my.toml --seed 7 --level attitude      a file of your own
   mavsitl fly hover-wind --set noise.position_m=0.02 --set offnominal.mass_scale=1.3
   mavsitl fly --in-memory                            one process, no sockets, the same bytes
+  mavsitl fly formation-spiral --count 9             nine vehicles and their controllers in one process
+"""
+
+TUNE_HELP = """\
+Search the gains and learning rates of a controller over whole flights in memory. Each candidate flies every scenario
+under the same few seeds; what is found is then judged against the start on seeds that the search has not seen. Without
+a scenario the paper's four experiments are flown together.
+
+  error      of each scenario and state the RMSE over the paper's number in Tables 3 and 4, or in a scenario that is
+             none of the paper's over 0.1 m and 0.5 degrees; of these ratios the 4-norm: the worst count most
+  effort     RMS of the rotors' speeds about their mean, rad/s
+  searched   the least error x effort^W, W being --effort-weight; a lost flight is worse than any that was flown
+
+The search starts at the gains that the scenarios have, and is SciPy's COBYQA. --tune KEY=LOW:HIGH names what is turned
+and how far, with :log or :linear behind it for how the range is divided; without a range it is a fifth of the value to
+five times that; without --tune it is every gain, filter, learning rate and observer bandwidth that the controller
+reads. An array such as controller.learning.rate is turned as one, or item by item: controller.learning.rate[0].
+
+The folder gets each scenario with the gains found, tune.json with every candidate, report.html, one self-contained
+page, and rows.jsonl, every flight so far: the same command goes on where it was ended. Ctrl-C gives the best so far.
+
+SEEDS is N for 1 to N, or FIRST-LAST, or N,N,N; those to search on and those to judge by have none in common.
+"""
+
+TUNE_EXAMPLES = """\
+examples:
+  mavsitl tune                                       the paper's controller on the paper's four experiments
+  mavsitl tune hover-wind-realistic --jobs 8 --evaluations 300
+  mavsitl tune my.toml --tune controller.position.k_p_per_s2=1:20 --tune controller.learning.rate=1:100:log
+  mavsitl tune hover-wind --search-duration 20 --effort-weight 0.5 --output runs/gentle
+  mavsitl tune --seeds 2001-2008 --held-out 50 --scheduler tcp://192.0.2.7:8786
 """
 
 VEHICLE_HELP = """\
@@ -85,6 +132,8 @@ examples:
   mavsitl vehicle hover-wind --instance 1            a second one: ports 18571, 14581, system id 2
   mavsitl vehicle hover-wind --bind 0.0.0.0 --insecure --offboard-remote 192.0.2.7:14540
   mavsitl vehicle --chaos ack-first-lost --chaos ftp-drops:0.3@gcs
+  mavsitl vehicle formation-spiral --count 9         nine in one process: system ids 1 to 9, ports 14580 to 14588
+  mavsitl vehicle formation-spiral --count 9 --one-link   nine behind the first one's ports
 """
 
 CHAOS_HELP = """\
@@ -105,6 +154,7 @@ examples:
   mavsitl ground hover-wind                          listens on udpin:127.0.0.1:14540, as PX4's users expect
   mavsitl ground hover-wind --link udpin:0.0.0.0:14540
   mavsitl ground spiral-calm --link udpout:192.0.2.9:14580 --system 3
+  mavsitl ground formation-spiral --count 9          for nine vehicles, at udpin:127.0.0.1:14540 to 14548
 """
 
 CHECK_HELP = """\
@@ -185,6 +235,34 @@ examples:
   mavsitl param list "SIM_*"
 """
 
+SWEEP_HELP = """\
+Fly every combination of the settings with every seed: whole flights in memory, on all cores of this machine or on a
+Dask cluster. Each flight is a row: flown, lost (too far from its reference), or failed, with what went wrong.
+
+The folder gets rows.jsonl, row by row, then results.parquet and report.html. A sweep that was interrupted or killed
+goes on with the same command. A flight is known by its scenario, airframe, seed and the code that flies: where one of
+these has changed it is flown again, else it is not.
+
+  --set KEY=A,B,C            these values; an array or table of TOML is one value
+  --set KEY=START:STOP:STEP  a range, STOP included: 0:10:5 is 0, 5, 10
+  --set KEY=A                this value in every flight
+  --seeds N                  seeds 1 to N; also N,N,N and FIRST-LAST
+
+A key with two values is compared seed by seed: the same seed is the same air and the same noise.
+"""
+
+SWEEP_EXAMPLES = """\
+examples:
+  mavsitl sweep hover-wind --set wind.speed_20ft_m_s=0,5,10 --seeds 50
+  mavsitl sweep hover-wind --set controller.law=pid,pidnn --seeds 50 --jobs 4
+  mavsitl sweep spiral-wind --set offnominal.mass_scale=0.8:1.4:0.1 --compare controller.law=pid,pidnn
+  mavsitl sweep my.toml --compare controller.learning.rate=[0,0,0],[1,1,1],[10,10,10] --seeds 20
+  mavsitl sweep hover-wind --seeds 1000 --scheduler tcp://192.0.2.7:8786
+
+Exit codes: 0 every flight has its row, lost ones too; 1 some failed by an error, or the sweep did; 2 wrong arguments;
+130 interrupted.
+"""
+
 ASK_EPILOG = """
 Exit codes: 0 done; 1 refused, or no answer (the message says by whom and what to do); 2 wrong arguments.
 """
@@ -237,6 +315,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if run is None:
         parser.print_help()
         return EXIT_USAGE
+    process.one_blas_thread()
     try:
         return run(options)
     except KeyboardInterrupt as interrupt:
@@ -256,19 +335,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _exit_code(error: Exception) -> int | None:
     """Of an error whose text is for the user; None for any other. They are loaded here: most runs have none."""
+    from mavsitl.campaign.errors import CampaignError, GridError
     from mavsitl.chaos.table import ChaosError
     from mavsitl.ends import ExposedError
     from mavsitl.link.address import AddressError
     from mavsitl.link.base import LinkError
     from mavsitl.log.errors import LogError
     from mavsitl.pair import PairError
+    from mavsitl.realtime import RealTimeError
     from mavsitl.report.run import RunError
     from mavsitl.scenario import ScenarioError
     from mavsitl.wings import WingError
 
-    if isinstance(error, (UsageError, ExposedError, ScenarioError, ChaosError, AddressError, WingError)):
+    if isinstance(error, (UsageError, ExposedError, ScenarioError, GridError, ChaosError, AddressError, WingError)):
         return EXIT_USAGE
-    return EXIT_FAILED if isinstance(error, (LinkError, LogError, PairError, RunError)) else None
+    failed = (LinkError, LogError, PairError, RealTimeError, RunError, CampaignError)
+    return EXIT_FAILED if isinstance(error, failed) else None
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -283,6 +365,8 @@ def build_parser() -> argparse.ArgumentParser:
     _add_link(commands)
     _add_inject(commands)
     _add_param(commands)
+    _add_sweep(commands)
+    _add_tune(commands)
     _add_report(commands)
     _add_scenarios(commands)
     _add_chaos(commands)
@@ -336,11 +420,14 @@ def _speed(text: str) -> float:
 
 _PORT = _whole(0, 65535)
 _SYSTEM = _whole(1, 255)
+_COUNT = _whole(1, MAX_VEHICLES)
 
 
-def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
+def _add_scenario_options(parser: argparse.ArgumentParser, *, seed: bool = True) -> None:
+    """`seed`: False for a command that flies many seeds."""
     group = parser.add_argument_group("scenario")
-    group.add_argument("--seed", type=int, metavar="N", help="seed of wind and noise (scenario key: seed)")
+    if seed:
+        group.add_argument("--seed", type=int, metavar="N", help="seed of wind and noise (scenario key: seed)")
     group.add_argument("--airframe", metavar="NAME", help="paper, realistic, full-coupling or a .toml file (airframe)")
     group.add_argument("--law", choices=("pidnn", "pid"), help="attitude law (controller.law)")
     group.add_argument("--level", choices=("attitude", "body_rate", "torque"), help="command level (controller.level)")
@@ -373,9 +460,56 @@ def _add_fly(commands: Any) -> None:
     group = parser.add_argument_group("run")
     group.add_argument("--run-dir", type=Path, metavar="DIR", help="run folder (default: runs/<UTC time>)")
     group.add_argument("--in-memory", action="store_true", help="both ends in one process, no sockets; the same bytes")
+    group.add_argument(
+        "--count", type=_COUNT, metavar="N",
+        help="a formation of N vehicles, each with its controller, in one process; logs and a table, no report",
+    )  # fmt: skip
     group.add_argument("--no-report", action="store_true", help="logs and tables only")
     group.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
     parser.set_defaults(run=_fly)
+
+
+def _add_tune(commands: Any) -> None:
+    parser = _command(
+        commands, "tune", "search a controller's gains, and judge them on other seeds", TUNE_HELP, TUNE_EXAMPLES
+    )
+    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="a shipped scenario's name or a .toml file")
+    _add_scenario_options(parser, seed=False)
+    group = parser.add_argument_group("search")
+    group.add_argument(
+        "--tune", action="append", default=[], metavar="KEY[=LOW:HIGH]", dest="keys",
+        help="a key of controller or parameters, and its range; may be repeated",
+    )  # fmt: skip
+    group.add_argument(
+        "--evaluations", type=_whole(1, 1_000_000), default=150, metavar="N", help="candidates (default: 150)"
+    )
+    group.add_argument(
+        "--effort-weight", type=_not_negative, default=0.3, metavar="W",
+        help="what 1 %% of effort has to buy, in %% of error (default: 0.3)",
+    )  # fmt: skip
+    group.add_argument(
+        "--seeds", default="1001-1003", metavar="SEEDS", help="flown by each candidate (default: 1001-1003)"
+    )
+    group.add_argument("--held-out", default="20", metavar="SEEDS", help="judged by (default: 20, which is 1 to 20)")
+    group.add_argument(
+        "--search-duration", type=_above_zero, metavar="S",
+        help="fly so much of each flight in the search; judged is the whole (default: all of it)",
+    )  # fmt: skip
+    group.add_argument(
+        "--search-seed", type=_whole(0, 2**31), default=1, metavar="N", help="of the search itself (default: 1)"
+    )
+    group = parser.add_argument_group("run")
+    group.add_argument("--jobs", type=_whole(1, 4096), metavar="N", help="processes (default: one for each core)")
+    group.add_argument(
+        "--scheduler", type=_scheduler, metavar="ADDRESS",
+        help="of a Dask cluster, tcp://HOST:PORT, in place of processes",
+    )  # fmt: skip
+    group.add_argument(
+        "--output", type=Path, metavar="DIR",
+        help="folder (default: runs/tune-SCENARIO); what is there is gone on with",
+    )  # fmt: skip
+    group.add_argument("--json", action="store_true", help="print tune.json and nothing else")
+    parser.set_defaults(run=_tune)
 
 
 def _add_vehicle(commands: Any) -> None:
@@ -393,6 +527,14 @@ def _add_vehicle(commands: Any) -> None:
         "--system", type=_SYSTEM, metavar="ID", help="MAVLink system id, 1 to 255 (default: instance + 1)"
     )
     group.add_argument(
+        "--count", type=_COUNT, metavar="N",
+        help="N vehicles in this process, the instances I and after it: each further one adds 1 to ports and system id",
+    )  # fmt: skip
+    group.add_argument(
+        "--one-link", action="store_true", default=None,
+        help="with --count: all behind the first one's ports, told apart by system id",
+    )  # fmt: skip
+    group.add_argument(
         "--bind", default="127.0.0.1", metavar="HOST", help="local address of all links (default: 127.0.0.1)"
     )
     group.add_argument(
@@ -403,7 +545,9 @@ def _add_vehicle(commands: Any) -> None:
         "--offboard-port", type=_PORT, metavar="N", help="local port of the off-board link (default: 14580 + I)"
     )
     group.add_argument(
-        "--offboard-remote", metavar="HOST:PORT", help="where it sends first (default: 127.0.0.1:14540 + I)"
+        "--offboard-remote",
+        metavar="HOST:PORT",
+        help="where it sends first (default: 127.0.0.1:14540 + I, at most 14549)",
     )
     group.add_argument(
         "--gcs-port", type=_PORT, metavar="N", help="local port of the ground-station link (default: 18570 + I)"
@@ -440,16 +584,26 @@ def _add_ground(commands: Any) -> None:
     group = parser.add_argument_group("link")
     group.add_argument(
         "--link",
-        default="udpin:127.0.0.1:14540",
         metavar="ENDPOINT",
-        help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or tcpin:HOST:PORT (default: udpin:127.0.0.1:14540)",
+        help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or tcpin:HOST:PORT "
+        "(default: udpin:127.0.0.1:14540 + I; from I = 10 on udpout:127.0.0.1:14580 + I)",
     )
     group.add_argument(
         "--system",
         type=_SYSTEM,
         metavar="ID",
-        help="fly only the vehicle with this system id (default: the first heard)",
+        help="fly only the vehicle with this system id (default: the first heard; with --count, of the first: I + 1)",
     )
+    group.add_argument(
+        "--count", type=_COUNT, metavar="N", help="fly N vehicles in the scenario's formation, each on its own port"
+    )
+    group.add_argument(
+        "--one-link", action="store_true", default=None, help="with --count: all of them are heard at --link"
+    )
+    group.add_argument(
+        "--instance", type=_whole(0, 254), default=0, metavar="I",
+        help="adds I to the default's port; with --count, of the first vehicle (default: 0)",
+    )  # fmt: skip
     group.add_argument(
         "--vehicle",
         metavar="HOST:PORT",
@@ -476,6 +630,14 @@ def _add_end_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="lock-step: run on this CPU from the first exchange on; the same for both is fastest",
     )
+    group.add_argument(
+        "--realtime", action="store_true", default=None,
+        help="keep the time on a busy machine: a real-time priority and locked memory (Linux, where it is allowed)",
+    )  # fmt: skip
+    group.add_argument(
+        "--best-effort", action="store_true", default=None,
+        help="with --realtime: go on without what is not allowed, and say what that is",
+    )  # fmt: skip
     group.add_argument("--run-dir", type=Path, metavar="DIR", help="write logs there (default: none)")
     group.add_argument("--wing", metavar="NAME", help="another installed vehicle or controller, by its entry point")
     group.add_argument(
@@ -551,6 +713,44 @@ def _add_param(commands: Any) -> None:
     parser.set_defaults(run=_param)
 
 
+def _add_sweep(commands: Any) -> None:
+    parser = _command(commands, "sweep", "fly a grid of settings and seeds, and compare", SWEEP_HELP, SWEEP_EXAMPLES)
+    parser.add_argument("scenario", metavar="SCENARIO", help="a shipped scenario's name or a .toml file")
+    group = parser.add_argument_group("grid")
+    group.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUES", dest="settings",
+        help="any key of the scenario, dotted, with its values; may be repeated",
+    )  # fmt: skip
+    group.add_argument(
+        "--compare", action="append", default=[], metavar="KEY=VALUES",
+        help="as --set, and each further value is compared with the first, seed by seed; may be repeated",
+    )  # fmt: skip
+    group.add_argument("--seeds", default="10", metavar="SEEDS", help="default: 10, which is 1 to 10")
+    group = parser.add_argument_group("run")
+    group.add_argument("--jobs", type=_whole(1, 4096), metavar="N", help="processes (default: one for each core)")
+    group.add_argument(
+        "--scheduler",
+        type=_scheduler,
+        metavar="ADDRESS",
+        help="of a Dask cluster, tcp://HOST:PORT, in place of processes",
+    )
+    group.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder (default: runs/sweep-SCENARIO); what is there is gone on with",
+    )
+    group.add_argument("--no-report", action="store_true", help="results and tables only")
+    group.add_argument("--json", action="store_true", help="print the summary as JSON and nothing else")
+    parser.set_defaults(run=_sweep)
+
+
+def _scheduler(text: str) -> str:
+    if not re.fullmatch(r"(tcp|tls|ucx|wss?)://\S+:\d+", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: tcp://HOST:PORT or tls://HOST:PORT")
+    return text
+
+
 def _add_ask_options(parser: argparse.ArgumentParser, default: str) -> None:
     group = parser.add_argument_group("vehicle")
     group.add_argument(
@@ -597,7 +797,7 @@ def _settings(options: argparse.Namespace) -> list[str]:
     """All scenario options as KEY=VALUE, the form in which they are handed on to the processes."""
     settings = list(options.settings)
     named = {
-        "seed": options.seed, "airframe": options.airframe,
+        "seed": getattr(options, "seed", None), "airframe": options.airframe,
         "controller.law": options.law, "controller.level": options.level,
         "controller.wind_information": options.wind_information, "duration_s": options.duration,
     }  # fmt: skip
@@ -610,6 +810,13 @@ def _settings(options: argparse.Namespace) -> list[str]:
 def _load(name: str, settings: Sequence[str]) -> Flight:
     from mavsitl import scenario
 
+    return scenario.load(name, _overrides(settings))
+
+
+def _overrides(settings: Sequence[str]) -> dict[str, Any]:
+    """What --set and the named options change. Raises `ScenarioError`."""
+    from mavsitl import scenario
+
     overrides: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
@@ -619,7 +826,7 @@ def _load(name: str, settings: Sequence[str]) -> Flight:
             overrides[key.strip()] = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             overrides[key.strip()] = text
-    return scenario.load(name, overrides)
+    return overrides
 
 
 def _endpoint(text: str, option: str) -> tuple[str, int]:
@@ -644,6 +851,8 @@ def _fly(options: argparse.Namespace) -> int:
     settings = _settings(options)
     names = options.scenarios or list(PAPER_SCENARIOS)
     flights = [_load(name, settings) for name in names]
+    if options.count is not None:
+        return _fly_fleet(options, flights)
     created = utc_stamp()
     folder: Path = options.run_dir or Path("runs") / created.replace(":", "").replace("-", "")
     console = Console(stderr=options.json)
@@ -665,6 +874,38 @@ def _fly(options: argparse.Namespace) -> int:
         console.print(f"interrupted; the logs so far are in {folder}")
         raise
     return _show(console, options, folder, records)
+
+
+def _fly_fleet(options: argparse.Namespace, flights: list[Flight]) -> int:
+    """A formation in memory; there is no page for one, each vehicle's logs have a folder."""
+    from rich.console import Console
+
+    from mavsitl import ends
+    from mavsitl.clock import utc_stamp
+
+    if len(flights) != 1:
+        raise UsageError(f"--count: one scenario, not {len(flights)}")
+    (flight,) = flights
+    folder: Path = options.run_dir or Path("runs") / utc_stamp().replace(":", "").replace("-", "")
+    console = Console(stderr=True)
+    with console.status(f"{flight.name}, {options.count} vehicles") as shown:
+
+        def move(time_s: float) -> None:
+            shown.update(f"{flight.name}, {options.count} vehicles: {max(time_s, 0.0):.1f} s")
+
+        outcome = ends.fleet_in_memory(
+            flight, folder / flight.name, count=options.count, report=lambda text: None, progress=move
+        )
+    if options.json:
+        import msgspec
+
+        event = outcome.as_event() | {"folder": str(folder)}
+        print(msgspec.json.format(msgspec.json.encode(event), indent=2).decode())
+    else:
+        for line in _fleet_table(outcome):
+            print(line)
+        print(f"logs: {folder}")
+    return EXIT_FAILED if outcome.lost or not outcome.finished else EXIT_OK
 
 
 def _fly_one(
@@ -752,6 +993,102 @@ def _show(console: Any, options: argparse.Namespace, folder: Path, records: list
     return EXIT_FAILED if lost else EXIT_OK
 
 
+def _tune(options: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from mavsitl.campaign import workers
+    from mavsitl.campaign.grid import parse_seeds
+    from mavsitl.campaign.store import Journal
+    from mavsitl.tune import flights, run
+
+    _on_signals(_interrupt)
+    if options.jobs is not None and options.scheduler is not None:
+        raise UsageError("--jobs: not with --scheduler, whose workers are what they are")
+    plan = run.Plan(
+        names=tuple(options.scenarios or PAPER_SCENARIOS), settings=_overrides(_settings(options)),
+        asked=tuple(options.keys), evaluations=options.evaluations, effort_weight=options.effort_weight,
+        seeds=parse_seeds(options.seeds), held_out=parse_seeds(options.held_out),
+        search_duration_s=options.search_duration, seed=options.search_seed,
+    )  # fmt: skip
+    tuning = run.begin(plan)
+    name = Path(plan.names[0]).stem if len(plan.names) == 1 else "several" if options.scenarios else "paper"
+    folder: Path = options.output or Path("runs") / f"tune-{name}"
+    command = "mavsitl " + shlex.join(sys.argv[1:])
+    console = Console(stderr=options.json, highlight=False)
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    bar = Progress(
+        TextColumn("{task.description}"), *columns, TextColumn("{task.fields[said]}"),
+        console=Console(stderr=True, highlight=False),
+    )  # fmt: skip
+    each = run.searched(tuning).each
+    jobs = options.jobs or min(workers.cores(), each)
+    crew = workers.Dask(options.scheduler) if options.scheduler else workers.local(jobs)
+    with Journal(folder / "rows.jsonl") as journal, crew, bar:
+        task = bar.add_task("tune", total=run.flights_of(tuning), said="")
+
+        def said(trial: Trial) -> None:
+            if trial.number == 0 and trial.score.lost:
+                text = f"the gains to begin with lose {trial.score.lost} of {each} flights: {trial.score.message}"
+                bar.console.print(text, soft_wrap=True, markup=False)
+            best = tuning.best.score
+            found = "all lost" if best.lost else f"best error {best.error:.4g}, effort {best.effort:.4g}"
+            bar.update(task, said=f"{trial.number + 1} tried, {found}")
+
+        try:
+            run.carry_out(tuning, flights.kept(journal, crew, lambda: bar.advance(task)), said)
+        except KeyboardInterrupt:
+            bar.stop()
+            if tuning.trials:
+                _show_tuning(console, options, tuning, folder, command)
+            console.print(f"interrupted; the same command goes on from {folder}", soft_wrap=True, markup=False)
+            raise
+    return _show_tuning(console, options, tuning, folder, command)
+
+
+def _show_tuning(console: Any, options: argparse.Namespace, tuning: Tuning, folder: Path, command: str) -> int:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from mavsitl.report import tune as report
+    from mavsitl.report.sweep_tables import bounds, probability
+    from mavsitl.report.tables import number
+    from mavsitl.tune import result
+
+    paths = [*result.write(tuning, folder, command), report.write(tuning, folder, command)]
+    if options.json:
+        print((folder / result.JSON_FILE).read_text("utf-8"), end="")
+        return EXIT_OK
+    table = Table("measure", "seeds", title="before and after", title_justify="left", title_style="bold")
+    for column in ("before", "after", "ratio, seed by seed", "p"):
+        table.add_column(column, justify="right")
+    for row in result.measures(tuning):
+        cells = [row.name, row.seeds, number(row.before), number(row.after)]
+        if row.paired is not None:
+            cells += [bounds(row.paired.ratio), probability(row.paired.p_value)]
+        table.add_row(*(escape(cell) for cell in cells))
+    console.print(table)
+    table = Table("key", title="gains", title_justify="left", title_style="bold")
+    for column in ("before", "after", "range", ""):
+        table.add_column(column, justify="right")
+    for gain in result.gains(tuning):
+        bound = "at its bound" if gain.at_bound else ""
+        key = gain.key.replace("[", r"\[")
+        table.add_row(key, f"{gain.before:.4g}", f"{gain.after:.4g}", f"{gain.low:.4g} to {gain.high:.4g}", bound)
+    console.print(table)
+    console.print(result.verdict(tuning), soft_wrap=True, markup=False)
+    for path in paths:
+        console.print(str(path), soft_wrap=True, markup=False)
+    return EXIT_OK
+
+
 def _loud(source: str) -> str:
     return "ORACLE (true wind)" if source == "oracle" else source
 
@@ -833,11 +1170,49 @@ class _Status:
                 f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
             )
 
+    def end_fleet(self, outcome: FleetOutcome) -> None:
+        if self._as_json:
+            self._print(outcome.as_event())
+            return
+        for line in _fleet_table(outcome):
+            print(line)
+
     def _print(self, event: dict[str, Any]) -> None:
         import msgspec
 
         sys.stdout.write(msgspec.json.encode(event).decode() + "\n")
         sys.stdout.flush()
+
+
+def _fleet_table(outcome: FleetOutcome) -> list[str]:
+    """For a person: each vehicle in a line, and what is of all."""
+    total = f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time"
+    lines = [f"{total}; {outcome.frames} frames in, {len(outcome.vehicles)} vehicles"]
+    if any(each.rms_m is not None for each in outcome.vehicles):
+        lines.append(f"{'vehicle':>7} {'flown s':>8} {'rms m':>7} {'worst m':>8}  end")
+        for each in outcome.vehicles:
+            error = f"{'-':>7} {'-':>8}" if each.rms_m is None else f"{each.rms_m:7.3f} {each.worst_m:8.3f}"
+            end = f"lost: {each.lost}" if each.lost else "as planned" if each.finished else "not flown to its end"
+            lines.append(f"{each.system_id:7d} {each.flight_time_s:8.1f} {error}  {end}")
+    for collision in outcome.collisions:
+        lines.append(
+            f"collision of vehicles {collision.vehicle} and {collision.other} at t = {collision.time_s:.2f} s: "
+            f"{collision.distance_m:.2f} m"
+        )
+    if outcome.dropped:
+        lines.append("dropped: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
+    for each in outcome.vehicles:
+        for place, directions in each.link.items():
+            for direction, counts in directions.items():
+                shown = ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
+                lines.append(f"vehicle {each.system_id}, {place} {direction}: {shown}")
+    if outcome.lateness_us is not None:
+        p50, p99 = outcome.lateness_us
+        lines.append(
+            f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; "
+            f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
+        )
+    return lines
 
 
 def _check_effect(options: argparse.Namespace, end: str, names: Sequence[str]) -> None:
@@ -870,6 +1245,77 @@ def _state_folder(options: argparse.Namespace, system_id: int) -> Path | None:
     return user_data_path("mavsitl", appauthor=False) / f"vehicle-{system_id}"
 
 
+def _fleet_states(options: argparse.Namespace, system_id: int, count: int) -> list[Path | None]:
+    """Of each vehicle: in ``instance-<I>`` of a folder that is named, else where it would be of each alone."""
+    folders: list[Path | None] = []
+    for each in range(system_id, system_id + count):
+        folder = _state_folder(options, each)
+        folders.append(folder if folder is None or options.state_dir is None else folder / f"instance-{each - 1}")
+    return folders
+
+
+def _check_fleet(options: argparse.Namespace, system_id: int) -> int:
+    """The number of vehicles of a fleet; 0: it is no fleet."""
+    if options.count is None:
+        if options.one_link:
+            raise UsageError("--one-link: only with --count")
+        return 0
+    if options.lockstep:
+        raise UsageError("--count: not with --lockstep; mavsitl fly --count flies a formation in lock-step")
+    count: int = options.count
+    if system_id + count - 1 > MAX_VEHICLES:
+        last = system_id + count - 1
+        raise UsageError(f"--count {count}: system ids {system_id} to {last}; allowed: up to {MAX_VEHICLES}")
+    return count
+
+
+def _fleet(
+    options: argparse.Namespace, flight: Flight, first: VehicleLinks, system_id: int, count: int, wish: Wish
+) -> int:
+    """`first`: the links of the first vehicle."""
+    import dataclasses
+
+    from mavsitl import ends
+
+    if options.tcp_port is not None and not options.one_link:
+        raise UsageError("--tcp-port: with --count only with --one-link")
+    host, port = first.offboard_remote
+
+    def remote(j: int) -> int:
+        return port + j if options.offboard_remote else ends.offboard_remote_port(options.instance + j)
+
+    links = [
+        dataclasses.replace(
+            first, offboard_port=first.offboard_port + j, offboard_remote=(host, remote(j)), gcs_port=first.gcs_port + j
+        )
+        for j in range(1 if options.one_link else count)
+    ]
+    last = links[-1]
+    for name, used in (
+        ("--offboard-port", last.offboard_port),
+        ("--offboard-remote", last.offboard_remote[1]),
+        ("--gcs-port", last.gcs_port),
+    ):
+        if used > 65535:
+            raise UsageError(f"{name}: {count} vehicles would need ports up to {used}; allowed: up to 65535")
+    status = _Status(options.status == "json")
+    where = "all on one link" if options.one_link else "each further one's ports 1 higher"
+    status.say(
+        f"vehicles {system_id} to {system_id + count - 1} ({flight.name}): "
+        f"off-board {first.bind}:{first.offboard_port} -> {host}:{port}, ground station {first.bind}:{first.gcs_port} "
+        f"-> {first.gcs_remote[0]}:{first.gcs_remote[1]}, {where}; Ctrl-C ends it"
+    )
+    for window in flight.scenario.chaos:
+        status.say(f"misbehaves: {window.mode} on port {window.port}")
+    outcome = ends.fleet_realtime(
+        flight, links, options.run_dir, count=count, system_id=system_id, wing=options.wing,
+        speed=options.speed or 1.0, until_finished=bool(options.until_disarmed),
+        states=_fleet_states(options, system_id, count), report=status.say, stop=status.stop, progress=None, wish=wish,
+    )  # fmt: skip
+    status.end_fleet(outcome)
+    return EXIT_OK
+
+
 def _with_chaos(flight: Flight, modes: Sequence[str]) -> Flight:
     """The scenario's, and these from the start on. Raises `ChaosError`."""
     if not modes:
@@ -885,13 +1331,14 @@ def _with_chaos(flight: Flight, modes: Sequence[str]) -> Flight:
     return msgspec.structs.replace(flight, scenario=scenario)
 
 
+@process.starting()
 def _vehicle(options: argparse.Namespace) -> int:
     from mavsitl import ends
 
     flight = _with_chaos(_load(options.scenario, _settings(options)), options.chaos or ())
     instance = options.instance
     system_id = options.system if options.system is not None else instance + 1
-    offboard_remote = options.offboard_remote or f"127.0.0.1:{ends.OFFBOARD_REMOTE_PORT + instance}"
+    offboard_remote = options.offboard_remote or f"127.0.0.1:{ends.offboard_remote_port(instance)}"
     links = ends.VehicleLinks(
         bind=options.bind,
         offboard_port=options.offboard_port if options.offboard_port is not None else ends.OFFBOARD_PORT + instance,
@@ -908,10 +1355,13 @@ def _vehicle(options: argparse.Namespace) -> int:
         options,
         real_time_only=(
             "--speed", "--until-disarmed", "--gcs-port", "--gcs-remote", "--tcp-port", "--state-dir", "--no-state",
-            "--chaos",
+            "--chaos", "--realtime", "--best-effort",
         ),
         lockstep_only=("--deadline", "--cpu"),
     )  # fmt: skip
+    wish = _wish_for_real_time(options)
+    if count := _check_fleet(options, system_id):
+        return _fleet(options, flight, links, system_id, count, wish)
     status = _Status(options.status == "json")
     if options.lockstep:
         outcome = ends.vehicle_lockstep(
@@ -936,20 +1386,43 @@ def _vehicle(options: argparse.Namespace) -> int:
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
             until_finished=bool(options.until_disarmed), state=_state_folder(options, system_id),
-            report=status.say, stop=status.stop, progress=None,
+            report=status.say, stop=status.stop, progress=None, wish=wish,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK
 
 
+def _wish_for_real_time(options: argparse.Namespace) -> Wish:
+    from mavsitl.realtime import Wish
+
+    if options.best_effort and not options.realtime:
+        raise UsageError("--best-effort: only with --realtime")
+    if not options.realtime:
+        return Wish.ORDINARY
+    speed = getattr(options, "speed", None) or 1.0
+    if speed > 1.0:
+        raise UsageError(
+            f"--realtime: not with --speed {speed:g}: a vehicle faster than the machine would hold its core "
+            "from everything else; allowed: 1 or less"
+        )
+    return Wish.BEST_EFFORT if options.best_effort else Wish.DEMANDED
+
+
+@process.starting()
 def _ground(options: argparse.Namespace) -> int:
     from mavsitl import ends
     from mavsitl.link.address import parse_address
 
     flight = _load(options.scenario, _settings(options))
-    address = parse_address(options.link)
+    address = parse_address(options.link) if options.link else ends.ground_address(options.instance)
     _check_effect(options, "ground", ("--seed",))
-    _check_lockstep(options, real_time_only=(), lockstep_only=("--deadline", "--cpu", "--vehicle"))
+    _check_lockstep(
+        options, real_time_only=("--realtime", "--best-effort"), lockstep_only=("--deadline", "--cpu", "--vehicle")
+    )
+    wish = _wish_for_real_time(options)
+    first_id = options.system if options.system is not None else options.instance + 1
+    if count := _check_fleet(options, first_id):
+        return _ground_fleet(options, flight, address, first_id, count, wish)
     status = _Status(options.status == "json")
     if options.lockstep:
         if not address.kind.startswith("udp"):
@@ -966,8 +1439,37 @@ def _ground(options: argparse.Namespace) -> int:
         outcome = ends.ground_realtime(
             flight, address, options.run_dir,
             vehicle_system_id=options.system, wing=options.wing, report=status.say, stop=status.stop, progress=None,
+            wish=wish,
         )  # fmt: skip
     status.end(outcome)
+    return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED
+
+
+def _ground_fleet(
+    options: argparse.Namespace, flight: Flight, first: Address, system_id: int, count: int, wish: Wish
+) -> int:
+    """`first`: where the first vehicle, or all of them, are heard."""
+    from mavsitl import ends
+    from mavsitl.link.address import Address
+
+    links = 1 if options.one_link else count
+    if first.port + links - 1 > 65535:
+        raise UsageError(f"--link {first}: {count} vehicles would need ports up to {first.port + links - 1}")
+    addresses = [
+        Address(first.kind, first.host, first.port + j) if options.link else ends.ground_address(options.instance + j)
+        for j in range(links)
+    ]
+    status = _Status(options.status == "json")
+    where = first if links == 1 else f"{first} to {addresses[-1]}"
+    status.say(
+        f"ground ({flight.name}): waiting for vehicles {system_id} to {system_id + count - 1} on {where}; "
+        "Ctrl-C ends it"
+    )
+    outcome = ends.ground_fleet(
+        flight, addresses, options.run_dir, count=count, first_system_id=system_id, wing=options.wing,
+        report=status.say, stop=status.stop, wish=wish,
+    )  # fmt: skip
+    status.end_fleet(outcome)
     return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED
 
 
@@ -1219,6 +1721,134 @@ def _wish(text: str, to_set: bool) -> tuple[str, float | None]:
     except ValueError:
         raise UsageError(f"{text}: {value!r} is not a number") from None
     return name, number
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from mavsitl.campaign import optional, sweep, workers
+    from mavsitl.campaign.store import Journal
+    from mavsitl.clock import utc_stamp
+
+    _on_signals(_interrupt)
+    if options.jobs is not None and options.scheduler is not None:
+        raise UsageError("--jobs: not with --scheduler, whose workers are what they are")
+    plan = sweep.plan(options.scenario, options.settings, options.compare, options.seeds)
+    optional.need("pyarrow")  # before anything flies
+    name = plan.cases[0].flight.name
+    folder: Path = options.output or Path("runs") / f"sweep-{name}"
+    console = Console(stderr=options.json, highlight=False)
+    console.print(f"[bold]{name}[/]  {plan}", soft_wrap=True)
+    with Journal(folder / sweep.JOURNAL_FILE) as journal:
+        known = sweep.known(plan, journal)
+        for text in _told(known, len(plan.cases), folder):
+            console.print(text, soft_wrap=True, markup=False)
+        missing = len(plan.cases) - known.flown
+        if missing:
+            crew = workers.Dask(options.scheduler) if options.scheduler else workers.local(
+                min(options.jobs or workers.cores(), missing)
+            )  # fmt: skip
+            with crew:
+                _fly_missing(plan, journal, crew, known.flown, folder)
+        rows = sweep.rows(plan, journal)
+    facts = sweep.metadata(plan, "mavsitl " + shlex.join(sys.argv[1:]), utc_stamp())
+    results = sweep.save(plan, rows, folder, facts)
+    summary = sweep.summary(plan, rows)
+    page = None
+    if not options.no_report:
+        from mavsitl.report import sweep as report
+
+        page = report.write(folder, rows, summary, plan.grid.keys, facts)
+    if options.json:
+        _print_sweep_json(results, rows, summary)
+    else:
+        _show_sweep(console, summary)
+    for what, path in (("results", results), ("report", page)):
+        if path is not None:
+            console.print(f"{what + ':':8s} {path}", soft_wrap=True, markup=False)
+    failed = [row for row in rows if row.status == "failed"]
+    if failed:
+        said = sorted({row.message for row in failed})
+        console.print(f"{len(failed)} of {len(rows)} failed: {said[0]}", soft_wrap=True, markup=False, style="bold red")
+    return EXIT_FAILED if failed else EXIT_OK
+
+
+def _told(known: Known, total: int, folder: Path) -> list[str]:
+    """What of a sweep need not be flown again, and what has to, and why."""
+    told = []
+    if known.flown:
+        told.append(f"{known.flown} of {total} were flown before ({folder})")
+    if known.other_code:
+        told.append(f"{known.other_code} of {total} were flown before by other code, and are flown again")
+    if known.other_scenario:
+        told.append(
+            f"{known.other_scenario} of {total} were flown before with other settings or another scenario file, "
+            "and are flown again"
+        )
+    return told
+
+
+def _fly_missing(plan: Plan, journal: Journal, crew: Workers, before: int, folder: Path) -> None:
+    """With a progress bar on stderr."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from mavsitl.campaign import sweep
+
+    console = Console(stderr=True, highlight=False)
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    total, done = len(plan.cases), before
+    counts = {"lost": 0, "failed": 0}
+    with Progress(*columns, TextColumn("{task.fields[said]}"), console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("flights", total=total, completed=before, said="")
+        try:
+            for row in sweep.fly(plan, journal, crew):
+                done += 1
+                if not row.flown:
+                    counts[row.status] += 1
+                said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+                bar.update(task, advance=1, said=said)
+        except BaseException:
+            bar.stop()
+            console.print(
+                f"{done} of {total} are in {folder}; the same command goes on with the rest",
+                soft_wrap=True, markup=False,
+            )  # fmt: skip
+            raise
+
+
+def _print_sweep_json(results: Path, rows: Sequence[Row], summary: Summary) -> None:
+    import msgspec
+
+    counts = {status: sum(row.status == status for row in rows) for status in ("flown", "lost", "failed")}
+    shown = {"results": str(results), "flights": len(rows), **counts, **msgspec.to_builtins(summary)}
+    print(msgspec.json.format(msgspec.json.encode(shown), indent=2).decode())
+
+
+def _show_sweep(console: Console, summary: Summary) -> None:
+    from rich import box
+    from rich.table import Table
+
+    from mavsitl.report import sweep_tables
+
+    shown = [("medians, 95 % intervals", sweep_tables.cell_header(summary), sweep_tables.cell_rows(summary))]
+    if summary.comparisons:
+        header, rows = list(sweep_tables.COMPARISON_HEADER), sweep_tables.comparison_rows(summary)
+        shown.append(("seed by seed: median difference and ratio, Wilcoxon's p", header, rows))
+    for title, header, rows in shown:
+        table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+        for column in header:
+            table.add_column(column, justify="left" if column in ("", "measure") else "right")
+        for cells in rows:
+            table.add_row(*cells)
+        console.print(table)
 
 
 def _report(options: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -39,8 +40,34 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
+def _import_numba() -> Any:
+    """numba without scipy, until a kernel needs it; the module.
+
+    numba imports scipy for a look at its version, and its `_check_blas` imports all of scipy.linalg to know whether
+    there is a BLAS: 0.1 s and 17 MB for what no kernel here calls. Here it takes the BLAS for granted. numba asks again
+    when a kernel with a matrix product is compiled; there scipy is imported, or missed, as ever.
+    """
+    scipy_is_loaded = "scipy" in sys.modules
+    if not scipy_is_loaded:
+        sys.modules["scipy"] = None  # type: ignore[assignment]  # an import of it raises ImportError
+    try:
+        import numba
+        from numba.np import linalg
+    finally:
+        if not scipy_is_loaded:
+            del sys.modules["scipy"]
+    ensure_blas = getattr(linalg, "ensure_blas", None)  # where a later numba has none, there is nothing to put off
+    linalg.ensure_blas = lambda: None
+    try:
+        import numba.np.arraymath
+    finally:
+        linalg.ensure_blas = ensure_blas
+    return numba
+
+
 def _set_up_cache() -> None:
-    import numba
+    numba = _import_numba()
+
     import platformdirs
 
     if "NUMBA_CACHE_DIR" not in os.environ:

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from mavsitl.check import Check
     from mavsitl.link.impaired import Channels
 
+FROM_VEHICLE, FROM_GROUND = Direction.FROM_VEHICLE, Direction.FROM_GROUND
+
+CHORES_PERIODS = 50
+"""Lock-step: logs and progress are looked after so rarely."""
 FIRST_REPEAT_S = 0.1
 """Lock-step: the first datagram is repeated this often until the other side is there."""
 MAX_OUT_OF_STEP = 1000
@@ -127,11 +131,12 @@ class Tap:
 
     def hear(self, direction: Direction, now_us: int, datagram: bytes) -> None:
         self.wire.update(direction, datagram)
-        if self.started_us is None and direction is Direction.FROM_GROUND:
-            self.started_us = monotonic_us()
-        if self.tlog is not None:
-            if SETUP_SIGNING_ID in datagram:
+        if direction is FROM_GROUND:
+            if self.started_us is None:
+                self.started_us = monotonic_us()
+            if self.tlog is not None and SETUP_SIGNING_ID in datagram:  # a vehicle sends no key, and passes none on
                 datagram = _without_keys(datagram)
+        if self.tlog is not None:
             self.tlog.write(now_us, datagram)
 
     def tick(self, now_us: int, wall_us: int = 0) -> None:
@@ -178,21 +183,15 @@ class _Throttle:
             self._progress(core.flight_time_s)
 
 
-class _Pin:
-    """Moves the process to one CPU at the first exchange.
+def _pin(cpu: int | None) -> None:
+    """Move the process to one CPU, at the first exchange. Does nothing where the system has no such call.
 
-    Two that take turns never run at once and are faster on one core. Not before: until then each starts up,
-    which two cores do faster. Does nothing where the system has no such call.
+    Two that take turns never run at once and are faster on one core. Not before: until then each starts up, which two
+    cores do faster.
     """
-
-    def __init__(self, cpu: int | None) -> None:
-        self._cpu = cpu if hasattr(os, "sched_setaffinity") else None
-
-    def __call__(self) -> None:
-        if self._cpu is not None:
-            with contextlib.suppress(OSError):  # a CPU that we may not use: then the system chooses
-                os.sched_setaffinity(0, {self._cpu})
-            self._cpu = None
+    if cpu is not None and hasattr(os, "sched_setaffinity"):
+        with contextlib.suppress(OSError):  # a CPU that we may not use: then the system chooses
+            os.sched_setaffinity(0, {cpu})
 
 
 class LockstepError(LinkError):
@@ -223,26 +222,30 @@ def fly_in_memory(
 
         return _fly_impaired(vehicle, channels, exchange, tap, max_time_s, throttle)
     now_us, period_us, last_us = 0, vehicle.period_us, max_time_s * 1e6
-    ground_us = 0
+    ground_us = chores_us = 0
+    hear = tap.hear
     while True:
         vehicle.step(now_us)
+        left = vehicle.finished  # over UDP the ground's last words find nobody
         for datagram in vehicle.datagrams(0, combine=True):
-            tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+            hear(FROM_VEHICLE, now_us, datagram)
             ground.receive(0, datagram)
             ground_us = max(ground_us, ground.vehicle_time_us)
             ground.step(ground_us)
             for answer in ground.datagrams(0, combine=True):
-                if not vehicle.finished:  # over UDP it has left by now
-                    tap.hear(Direction.FROM_GROUND, now_us, answer)
+                if not left:
+                    hear(FROM_GROUND, now_us, answer)
                     vehicle.receive(0, answer)
-        if vehicle.finished and ground.finished:
+        if left and ground.finished:
             return now_us
         if vehicle.token_us != now_us:
             raise LockstepError(f"the ground did not answer the telemetry stamped {now_us} us")
         if now_us >= last_us:
             raise LockstepError(f"the flight did not end within {max_time_s:g} s of simulated time")
-        tap.tick(now_us)
-        throttle(vehicle)
+        if now_us >= chores_us:
+            chores_us = now_us + CHORES_PERIODS * period_us
+            tap.tick(now_us)
+            throttle.now(vehicle)
         now_us += period_us
 
 
@@ -283,10 +286,10 @@ def _fly_impaired(
             channels.to_ground.send(datagram, now_us)
         messages = channels.to_ground.due(now_us, EXCHANGE_BYTES)
         for message in messages:
-            tap.hear(Direction.FROM_VEHICLE, now_us, message)
+            tap.hear(FROM_VEHICLE, now_us, message)
         answers, last = exchange(now_us, messages)
         for answer in answers:
-            tap.hear(Direction.FROM_GROUND, now_us, answer)
+            tap.hear(FROM_GROUND, now_us, answer)
             channels.to_vehicle.send(answer, now_us)
         for message in channels.to_vehicle.due(now_us):
             vehicle.receive(0, message)
@@ -305,13 +308,13 @@ class _Exchanges:
     """The vehicle's side of the exchanges over UDP."""
 
     def __init__(
-        self, link: ConnectedUdp, vehicle: VehicleCore, throttle: _Throttle, pin: _Pin,
+        self, link: ConnectedUdp, vehicle: VehicleCore, throttle: _Throttle, cpu: int | None,
         deadline_s: float, start_deadline_s: float,
     ) -> None:  # fmt: skip
         self._link = link
         self._vehicle = vehicle
         self._throttle = throttle
-        self._pin = pin
+        self._cpu = cpu
         self._deadline_s = deadline_s
         self._start_deadline_s = start_deadline_s
         self._met = False
@@ -322,7 +325,7 @@ class _Exchanges:
             if self._receive(now_us, self._start_deadline_s, repeated=HELLO) != HELLO:
                 unpack(b"")  # says what is wrong
             self._met = True
-            self._pin()
+            _pin(self._cpu)
         self._link.send(pack(messages))
         answer = HELLO
         while answer == HELLO:  # of one that was repeated
@@ -337,14 +340,14 @@ def _receive(
     link: ConnectedUdp, core: Core, throttle: _Throttle, now_us: int, limit_s: float, repeated: bytes | None = None
 ) -> bytes:
     """The next datagram, waited for `limit_s` while progress is shown; `repeated` is sent again at each time-out."""
-    patience = round(limit_s / FIRST_REPEAT_S)
+    silent = 0
     while True:
         try:
             return link.receive()
         except LinkSilent as silence:
             throttle.now(core)
-            patience -= 1
-            if patience <= 0:
+            silent += 1
+            if silent >= round(limit_s / FIRST_REPEAT_S):
                 raise _stopped(now_us, limit_s, silence) from silence
             if repeated is not None:
                 link.send(repeated)
@@ -374,45 +377,48 @@ def run_lockstep_vehicle(
     """
     throttle = _Throttle(progress)
     if channels is not None:
-        exchange = _Exchanges(link, vehicle, throttle, _Pin(cpu), deadline_s, start_deadline_s)
+        exchange = _Exchanges(link, vehicle, throttle, cpu, deadline_s, start_deadline_s)
         return _fly_impaired(vehicle, channels, exchange, tap, max_time_s, throttle)
     now_us, period_us = 0, vehicle.period_us
-    repeat = round(1.0 / FIRST_REPEAT_S)
-    pin = _Pin(cpu)
+    chores_us = 0
+    limit_s, met = start_deadline_s, False
+    hear = tap.hear
     while True:
         vehicle.step(now_us)
         outbound = vehicle.datagrams(0, combine=True)
         for datagram in outbound:
-            tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+            hear(FROM_VEHICLE, now_us, datagram)
             link.send(datagram)
         if vehicle.finished:
             return now_us
-        limit_s = deadline_s if vehicle.token_us >= 0 else start_deadline_s
-        patience = round(limit_s * repeat)
-        out_of_step = 0
+        silent = out_of_step = 0
         while vehicle.token_us != now_us:
             try:
                 answer = link.receive()
             except LinkSilent as silence:
                 throttle.now(vehicle)
-                patience -= 1
-                if patience <= 0:
+                silent += 1
+                if silent >= round(limit_s / FIRST_REPEAT_S):
                     raise _stopped(now_us, limit_s, silence) from silence
                 if vehicle.token_us < 0:
                     for datagram in outbound:
                         link.send(datagram)
                 continue
-            tap.hear(Direction.FROM_GROUND, now_us, answer)
+            hear(FROM_GROUND, now_us, answer)
             vehicle.receive(0, answer)
-            pin()
+            if not met and vehicle.token_us >= 0:
+                limit_s, met = deadline_s, True
+                _pin(cpu)
             out_of_step += 1
             if out_of_step > MAX_OUT_OF_STEP:
                 raise LockstepError(
                     f"lock-step stopped at t = {now_us / 1e6:g} s: the other side answers, but with setpoints stamped "
                     f"{vehicle.token_us / 1e6:g} s; does it run --lockstep and echo the telemetry's stamp?"
                 )
-        tap.tick(now_us)
-        throttle(vehicle)
+        if now_us >= chores_us:
+            chores_us = now_us + CHORES_PERIODS * period_us
+            tap.tick(now_us)
+            throttle.now(vehicle)
         now_us += period_us
 
 
@@ -434,39 +440,42 @@ def run_lockstep_ground(
     datagram); `link` has a time-out of `FIRST_REPEAT_S`.
     """
     throttle = _Throttle(progress)
-    pin = _Pin(cpu)
     if impaired:
-        return _ground_impaired(ground, link, tap, deadline_s, start_deadline_s, pin, throttle)
-    now_us = 0
+        return _ground_impaired(ground, link, tap, deadline_s, start_deadline_s, cpu, throttle)
+    now_us = chores_us = 0
     last = b""
-    limit_s = start_deadline_s
+    limit_s, met = start_deadline_s, False
+    hear = tap.hear
     while not ground.finished:
         datagram = _receive(link, ground, throttle, now_us, limit_s)
-        limit_s = deadline_s
         if datagram == last:  # the vehicle repeats its first until it is answered
             continue
         last = datagram
+        if not met:
+            limit_s, met = deadline_s, True
+            _pin(cpu)
         if datagram == HELLO:
             unpack(b"")  # the other side has an impaired link: says so
-        pin()
         ground.receive(0, datagram)
         now_us = max(now_us, ground.vehicle_time_us)
-        tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+        hear(FROM_VEHICLE, now_us, datagram)
         ground.step(now_us)
         for answer in ground.datagrams(0, combine=True):
-            tap.hear(Direction.FROM_GROUND, now_us, answer)
+            hear(FROM_GROUND, now_us, answer)
             link.send(answer)
-        tap.tick(now_us)
-        throttle(ground)
+        if now_us >= chores_us:
+            chores_us = now_us + CHORES_PERIODS * ground.period_us
+            tap.tick(now_us)
+            throttle.now(ground)
     return now_us
 
 
 def _ground_impaired(
     ground: GroundCore, link: ConnectedUdp, tap: Tap, deadline_s: float, start_deadline_s: float,
-    pin: _Pin, throttle: _Throttle,
+    cpu: int | None, throttle: _Throttle,
 ) -> int:  # fmt: skip
     turns = _GroundTurns(ground)
-    limit_s = start_deadline_s
+    limit_s, met = start_deadline_s, False
     while not ground.finished:
         datagram = _receive(link, ground, throttle, max(turns.now_us, 0), limit_s)
         limit_s = deadline_s
@@ -474,12 +483,14 @@ def _ground_impaired(
             link.send(HELLO)
             continue
         messages, _ = unpack(datagram)
-        pin()
+        if not met:
+            met = True
+            _pin(cpu)
         answers = turns.take(messages)
         for message in messages:
-            tap.hear(Direction.FROM_VEHICLE, turns.now_us, message)
+            tap.hear(FROM_VEHICLE, turns.now_us, message)
         for answer in answers:
-            tap.hear(Direction.FROM_GROUND, turns.now_us, answer)
+            tap.hear(FROM_GROUND, turns.now_us, answer)
         link.send(pack(answers, last=ground.finished))
         tap.tick(turns.now_us)
         throttle(ground)
@@ -535,7 +546,7 @@ class Intake:
             for _ in range(min(TAKEN, len(queue))):
                 datagram, source = queue.get()
                 if port == 0:
-                    self._tap.hear(Direction.FROM_GROUND, now_us, datagram)
+                    self._tap.hear(FROM_GROUND, now_us, datagram)
                 if vehicle.receive(port, datagram, at_us()) and link.admit(source, wall_us):
                     budget.peer(source)
 
@@ -577,7 +588,7 @@ def run_realtime_vehicle(
         for port, link in enumerate(links):
             for datagram in vehicle.datagrams(port, combine=False):
                 if port == 0:
-                    tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+                    tap.hear(FROM_VEHICLE, now_us, datagram)
                 link.send(datagram)
 
     intake = Intake(vehicle, links, tap)
@@ -664,7 +675,7 @@ def run_realtime_ground(
             lost.tell(lost_us, wall_us)
         now_us = wall_us - start_us - lost_us
         for datagram, source in link.receive(wall_us - start_us):
-            tap.hear(Direction.FROM_VEHICLE, now_us, datagram)
+            tap.hear(FROM_VEHICLE, now_us, datagram)
             if ground.receive(0, datagram):
                 link.admit(source, wall_us - start_us)
         ground.step(now_us)
@@ -672,7 +683,7 @@ def run_realtime_ground(
             last = (ground.vehicle_time_us, wall_us)
             first = last if first is None or last[0] < first[0] else first
         for answer in ground.datagrams(0, combine=False):
-            tap.hear(Direction.FROM_GROUND, now_us, answer)
+            tap.hear(FROM_GROUND, now_us, answer)
             link.send(answer)
         tap.tick(now_us, wall_us)
         throttle(ground)

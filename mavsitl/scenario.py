@@ -6,6 +6,7 @@ what is allowed for whatever it does not accept.
 
 from __future__ import annotations
 
+import re
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -88,7 +89,8 @@ class Gust(Section, frozen=True, tag_field="model", tag="gust"):
 class DrydenPaper(Section, frozen=True, tag_field="model", tag="dryden-paper"):
     """Eqs 14-17 with Table 1's numbers (sigma_v = sigma_u^2 / sigma_w as printed, metres in the formulas)."""
 
-    wind_speed_20ft_m_s: Positive = 10.0
+    speed_20ft_m_s: NonNegative = 10.0
+    """0: no turbulence."""
     altitude_m: Positive = 1.0
     form: Literal["first-order", "spectrum"] = "first-order"
     """``first-order``: the filters of eq 17; ``spectrum``: second-order v and w filters that have eq 14's densities."""
@@ -99,7 +101,8 @@ class DrydenPaper(Section, frozen=True, tag_field="model", tag="dryden-paper"):
 class DrydenMil(Section, frozen=True, tag_field="model", tag="dryden-mil"):
     """MIL-F-8785C / MIL-HDBK-1797 low-altitude model, turned with the mean wind; the mean included on request."""
 
-    wind_speed_20ft_m_s: Positive
+    speed_20ft_m_s: NonNegative
+    """0: no turbulence, no mean."""
     altitude_m: Annotated[float, msgspec.Meta(gt=0.0, le=304.8)]
     from_deg: float = 0.0
     """Where the mean wind comes from, clockwise from north."""
@@ -330,6 +333,24 @@ class ParameterChange(Section, frozen=True):
     """Of `at_s`: since the release or the lift-off, or since the vehicle's start."""
 
 
+class Fleet(Section, frozen=True):
+    """Of a run with `--count`: vehicle 0 starts where the scenario says, the others where the formation has them."""
+
+    formation: Literal["grid", "line", "circle"] = "grid"
+    """A square filled row by row, eastward, then southward; a line to the east; a circle with vehicle 0 in the north.
+    References are shifted alike."""
+    spacing_m: Positive = 3.0
+    """Between neighbours."""
+    shared_wind: bool = False
+    """True: one turbulence that is everywhere the same; false: each vehicle has its own."""
+    collision_m: NonNegative = 0.5
+    """Two vehicles nearer than this have collided; 0: they are not looked at."""
+    collision_hz: Annotated[int, msgspec.Meta(ge=1, le=50)] = 20
+    """How often they are looked at."""
+    on_collision: Literal["report", "crash"] = "report"
+    """What it does: it is said to both and logged; or all rotors of both fail as well."""
+
+
 class Hover(Section, frozen=True, tag_field="kind", tag="hover"):
     position_nwu_m: Vector3 = (0.0, 0.0, 1.0)
     yaw_deg: float = 0.0
@@ -466,6 +487,7 @@ class Scenario(Section, frozen=True):
     """PX4 parameters of the vehicle, over the airframe's."""
     controller: Controller = Controller()
     reference: Reference = Hover()
+    fleet: Fleet = Fleet()
 
     @property
     def impaired(self) -> bool:
@@ -492,7 +514,9 @@ def names() -> list[str]:
 def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
     """Read a shipped scenario by name, or a file by path.
 
-    `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``. Raises `ScenarioError`.
+    `overrides` are dotted keys, e.g. ``{"controller.law": "pid"}``; through an array of tables they go by the index,
+    ``wind[0].altitude_m``, or without it where there is one alone. What stands beside a key in a table that the file
+    leaves out keeps its default. Raises `ScenarioError`.
     """
     text, where, folder = _read("scenarios", name_or_path, names())
     data = _parse(text, where)
@@ -506,6 +530,11 @@ def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
     _check(scenario, where)
     name = name_or_path.removesuffix(".toml").replace("\\", "/").rsplit("/", 1)[-1]
     return Flight(name=name, scenario=scenario, airframe=load_airframe(scenario.airframe, folder))
+
+
+def text_of(name_or_path: str) -> str:
+    """The scenario's file as it is. Raises `ScenarioError`."""
+    return _read("scenarios", name_or_path, names())[0]
 
 
 def load_airframe(name_or_path: str, folder: Path | None = None) -> Airframe:
@@ -542,14 +571,53 @@ def _parse(text: str, where: str) -> dict[str, Any]:
         raise ScenarioError(f"{where}: not valid TOML: {error}") from error
 
 
+_STEP = re.compile(r"([^\[\]]+)(?:\[(\d+)\])?")
+"""A part of a dotted key, e.g. ``wind[0]``, as the messages about a scenario have it."""
+
+
 def _override(data: dict[str, Any], key: str, value: Any, where: str) -> None:
     *parents, last = key.split(".")
     table = data
+    path = ""
+    default: Any = Scenario(title="")
     for parent in parents:
-        table = table.setdefault(parent, {})
+        step = _STEP.fullmatch(parent)
+        if step is None:
+            raise ScenarioError(
+                f"{where}: {key}: '{parent}' is no part of a key; allowed: NAME or NAME[0], NAME[1], ..."
+            )
+        name, index = step[1], step[2]
+        path = _join(path, name)
+        default = getattr(default, name, None)
+        table = table.setdefault(name, _whole(default))
+        if isinstance(table, list):
+            table = _element(table, index, path, key, where)
+            path += f"[{index or 0}]"
+        elif index is not None:
+            raise ScenarioError(f"{where}: {key}: '{path}' is no array, so it has no element {index}")
         if not isinstance(table, dict):
-            raise ScenarioError(f"{where}: {key}: '{parent}' is not a table, so it has no key to set")
+            raise ScenarioError(f"{where}: {key}: '{path}' is not a table, so it has no key to set")
     table[last] = value
+
+
+def _whole(default: Any) -> dict[str, Any]:
+    """A table to set one key in: its default where it is one that must be given whole, as `Gains`."""
+    if isinstance(default, Section) and any(field.required for field in msgspec.structs.fields(default)):
+        table: dict[str, Any] = msgspec.to_builtins(default)
+        return table
+    return {}
+
+
+def _element(array: list[Any], index: str | None, path: str, key: str, where: str) -> Any:
+    """Of an array of tables: the one with that index, or without it the only one."""
+    if index is None and len(array) == 1:
+        return array[0]
+    if not array:
+        raise ScenarioError(f"{where}: {key}: '{path}' is empty, so it has no element to set")
+    if index is None or int(index) >= len(array):
+        allowed = ", ".join(f"{path}[{number}]" for number in range(len(array)))
+        raise ScenarioError(f"{where}: {key}: '{path}' has {len(array)} element(s); allowed: {allowed}")
+    return array[int(index)]
 
 
 def _convert(data: dict[str, Any], kind: type[Any], where: str) -> Any:
@@ -718,6 +786,12 @@ def _check(scenario: Scenario, where: str) -> None:
     if controller.inner == "pidnn" and controller.level != "attitude":
         raise ScenarioError(
             f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'"
+        )
+    fleet = scenario.fleet
+    if fleet.collision_m >= fleet.spacing_m:
+        raise ScenarioError(
+            f"{where}: fleet.collision_m: {fleet.collision_m:g} is not allowed; "
+            f"allowed: less than fleet.spacing_m ({fleet.spacing_m:g})"
         )
     _check_estimator(scenario, where)
     _check_link(scenario.link, f"{where}: link")

@@ -58,10 +58,13 @@ class Controller:
     No message, no clock but the vehicle's stamp.
     """
 
-    def __init__(self, flight: Flight) -> None:
-        """Raises `ScenarioError` where the airframe does not say what the command level needs."""
+    def __init__(self, flight: Flight, offset_nwu_m: Vector = (0.0, 0.0, 0.0)) -> None:
+        """`offset_nwu_m` moves the reference.
+
+        Raises `ScenarioError` where the airframe does not say what the command level needs.
+        """
         settings = flight.scenario.controller
-        self.reference = reference_for(flight.scenario.reference)
+        self.reference = reference_for(flight.scenario.reference, offset_nwu_m)
         self._memory = _at_rest(flight)
         self._at_rest = self._memory.copy()
         self.learns = settings.level != "attitude" and settings.law == "pidnn"
@@ -174,15 +177,19 @@ class Ground:
         *,
         report: Callable[[str], None] = lambda text: None,
         vehicle_system_id: int | None = None,
+        offset_nwu_m: Vector = (0.0, 0.0, 0.0),
     ) -> None:
-        """`report` gets a line at each step of the handshake and each STATUSTEXT of the vehicle."""
+        """`report` gets a line at each step of the handshake and each STATUSTEXT of the vehicle.
+
+        `offset_nwu_m`: the vehicle's place in a formation, by which the reference is moved.
+        """
         scenario = flight.scenario
         self.period_us = scenario.rates.control_period_us
         self._scenario = scenario
         self._send_demand = SENDS[scenario.controller.level]
         self._node = Node(SYSTEM_ID, COMPONENT_ID)
         self._observer = Observer(scenario.controller.telemetry)
-        self._controller = Controller(flight)
+        self._controller = Controller(flight, offset_nwu_m)
         self._report = report
         self._texts = Joiner()
         messages = [(message_id, self.period_us) for message_id in STATE_MESSAGES[scenario.controller.telemetry]]
@@ -231,6 +238,23 @@ class Ground:
     def flight_time_s(self) -> float:
         """By the vehicle's clock since the release; negative before it."""
         return -1.0 if self._released_us is None else (self._observer.stamp_us - self._released_us) / 1e6
+
+    @property
+    def in_control(self) -> bool:
+        """The vehicle flies and follows."""
+        return self._handshake.in_control
+
+    @property
+    def position_nwu_m(self) -> Vector:
+        """Of the vehicle, as last told."""
+        x, y, z = self._observer.position_nwu_m[:, 0].tolist()
+        return x, y, z
+
+    @property
+    def reference_nwu_m(self) -> Vector:
+        """Where it was to be when it was last controlled."""
+        x, y, z = self._controller.reference.now["position"][0, :, 0].tolist()
+        return x, y, z
 
     @property
     def vehicle_time_us(self) -> int:
@@ -367,6 +391,13 @@ class Ground:
         self._node.send(COMMAND_LONG, system_id, component_id, command, confirmation, *params)
 
 
-def build(flight: Flight, recorder: Recorder, **options: Any) -> Ground:
-    """The entry point `mavsitl.ground`: a ground core for the bridge's drivers."""
-    return Ground(flight, recorder, **options)
+def build(flight: Flight, recorder: Any, *, count: int | None = None, **options: Any) -> Any:
+    """The entry point `mavsitl.ground`: a ground core for the bridge's drivers; with `count` a `Formation`.
+
+    `recorder` is one of these, for a formation as many.
+    """
+    if count is None:
+        return Ground(flight, recorder, **options)
+    from mavsitl_ground.formation import Formation  # here, for it is made of grounds
+
+    return Formation(flight, recorder, count=count, **options)

@@ -98,19 +98,31 @@ def figure_8(table: Floats, time_s: float, out: Record) -> None:
 class ReferencePath:
     """A scenario's reference: a compiled function of time over a table, and its newest sample."""
 
-    def __init__(self, law: Callable[[Floats, float, Record], None], table: Sequence[Sequence[float]]) -> None:
+    def __init__(
+        self,
+        law: Callable[[Floats, float, Record], None],
+        table: Sequence[Sequence[float]],
+        offset_nwu_m: Vector3 = STILL,
+    ) -> None:
+        """`offset_nwu_m` moves the path, in metres: to a place of a formation."""
         self._law = law
+        self._offset = None if offset_nwu_m == STILL else np.array(offset_nwu_m)
         self._table = np.array(table, dtype=np.float64)
         self._constant = law is legs and len(table) == 1
         vector = np.zeros((3, 1))
         self.now = record(position=vector, velocity=vector, acceleration=vector, yaw=[0.0])
         """Position m, velocity m/s, acceleration m/s^2, NWU, (3, 1) each, and yaw rad, (1,), of the last `move`."""
-        law(self._table, 0.0, self.now)
+        self._sample(0.0)
 
     def move(self, time_s: float) -> None:
         """`now` as of `time_s` after the start of the flight; before it, as at 0."""
         if not self._constant:
-            self._law(self._table, max(time_s, 0.0), self.now)
+            self._sample(max(time_s, 0.0))
+
+    def _sample(self, time_s: float) -> None:
+        self._law(self._table, time_s, self.now)
+        if self._offset is not None:
+            self.now["position"][0, :, 0] += self._offset
 
     def sample(self, time_s: float) -> Sample:
         """The reference at one time, as tuples."""
@@ -195,18 +207,25 @@ def read_waypoints(file: str) -> list[tuple[float, float, float, float, float]]:
     return rows
 
 
-def reference_for(reference: Reference) -> ReferencePath:
-    """The path that a scenario's reference describes. Raises `ScenarioError` for a waypoint file that is not one."""
+def reference_for(reference: Reference, offset_nwu_m: Vector3 = STILL) -> ReferencePath:
+    """The path that a scenario's reference describes, moved by `offset_nwu_m` in metres.
+
+    Raises `ScenarioError` for a waypoint file that is not one.
+    """
+    return ReferencePath(*_path(reference), offset_nwu_m)
+
+
+def _path(reference: Reference) -> tuple[Callable[[Floats, float, Record], None], list[tuple[float, ...]]]:
+    """A law, and its table."""
     match reference:
         case Hover():
-            return ReferencePath(legs, [_leg(0.0, reference.position_nwu_m, radians(reference.yaw_deg))])
+            return legs, [_leg(0.0, reference.position_nwu_m, radians(reference.yaw_deg))]
         case Steps():
-            steps = reference.steps
-            return ReferencePath(legs, [_leg(s.time_s, s.position_nwu_m, radians(s.yaw_deg)) for s in steps])
+            return legs, [_leg(s.time_s, s.position_nwu_m, radians(s.yaw_deg)) for s in reference.steps]
         case Waypoints():
-            return ReferencePath(legs, _waypoint_legs(read_waypoints(reference.file), reference.speed_m_s))
+            return legs, _waypoint_legs(read_waypoints(reference.file), reference.speed_m_s)
         case Spiral():
-            return ReferencePath(spiral, [(reference.radius_m, reference.rate_rad_s, reference.climb_m_s)])
+            return spiral, [(reference.radius_m, reference.rate_rad_s, reference.climb_m_s)]
         case Figure8():
             x, y, rate = reference.length_m / 2.0, reference.width_m / 2.0, 2.0 * pi / reference.period_s
-            return ReferencePath(figure_8, [(x, y, reference.altitude_m, rate, reference.ramp_s)])
+            return figure_8, [(x, y, reference.altitude_m, rate, reference.ramp_s)]

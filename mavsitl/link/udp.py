@@ -254,18 +254,27 @@ class ConnectedUdp:
         Raises:
             LinkError: the socket failed or is closed, or the datagram is longer than UDP carries.
         """
-        for _ in range(2):
-            try:
-                self._socket.send(datagram)
-                return
-            except ConnectionError:
-                continue  # the report belongs to an earlier datagram and this one has not gone
-            except OSError as error:
-                raise self._failure("send", error) from error
+        try:
+            self._socket.send(datagram)
+        except OSError as error:
+            self._send_again(datagram, error)
 
     def close(self) -> None:
         """Close the socket; a second call does nothing."""
         self._socket.close()
+
+    def _send_again(self, datagram: bytes, error: OSError) -> None:
+        """After "nobody listens there", which belongs to an earlier datagram: this one has not gone."""
+        if isinstance(error, ConnectionError):
+            try:
+                self._socket.send(datagram)
+            except ConnectionError:
+                return
+            except OSError as again:
+                error = again
+            else:
+                return
+        raise self._failure("send", error) from error
 
     def _receive_after_refusal(self) -> bytes:
         """The wait after "nobody listens there", which would otherwise cut it short."""

@@ -85,7 +85,7 @@ def wind(flight: FlightData, counterpart: str) -> Drawing:
             axes.set_ylabel(f"{name} / (m/s)")
             _mark([axes], flight)
 
-    return Drawing(_svg(draw, 4.2, "wind"), "Wind along x, y and z at the vehicle", counterpart)
+    return Drawing(svg(draw, 4.2, "wind"), "Wind along x, y and z at the vehicle", counterpart)
 
 
 def altitude(flights: Flights, counterpart: str) -> Drawing:
@@ -95,7 +95,7 @@ def altitude(flights: Flights, counterpart: str) -> Drawing:
         axes.set_ylabel("z / m")
         _legend(figure, axes)
 
-    return Drawing(_svg(draw, 2.9, "altitude"), "Altitude", counterpart)
+    return Drawing(svg(draw, 2.9, "altitude"), "Altitude", counterpart)
 
 
 def horizontal(flights: Flights, counterpart: str) -> Drawing:
@@ -106,7 +106,7 @@ def horizontal(flights: Flights, counterpart: str) -> Drawing:
             axes.set_ylabel(f"{'xy'[axis]} / m")
         _legend(figure, rows[0])
 
-    return Drawing(_svg(draw, 3.9, "horizontal"), "Horizontal position", counterpart)
+    return Drawing(svg(draw, 3.9, "horizontal"), "Horizontal position", counterpart)
 
 
 def position(flights: Flights, counterpart: str) -> Drawing:
@@ -117,7 +117,7 @@ def position(flights: Flights, counterpart: str) -> Drawing:
             axes.set_ylabel(f"{'xyz'[axis]} / m")
         _legend(figure, rows[0])
 
-    return Drawing(_svg(draw, 5.2, "position"), "Position by axis", counterpart)
+    return Drawing(svg(draw, 5.2, "position"), "Position by axis", counterpart)
 
 
 def path_3d(flights: Flights, counterpart: str) -> Drawing:
@@ -145,7 +145,7 @@ def path_3d(flights: Flights, counterpart: str) -> Drawing:
             plane.pane.set_edgecolor("#d4d4da")
         figure.legend(*axes.get_legend_handles_labels(), loc="upper left", ncols=1)
 
-    return Drawing(_svg(draw, 6.2, "path"), "Path in space", counterpart)
+    return Drawing(svg(draw, 6.2, "path"), "Path in space", counterpart)
 
 
 def attitude(flight: FlightData, colour: str, air: str, counterpart: str) -> Drawing:
@@ -166,7 +166,7 @@ def attitude(flight: FlightData, colour: str, air: str, counterpart: str) -> Dra
         _time_axis(grid[2], flight.time_s)
         _legend(figure, grid[0][0])
 
-    return Drawing(_svg(draw, 5.2, "attitude"), f"Attitude and its tracking error, {air}", counterpart)
+    return Drawing(svg(draw, 5.2, "attitude"), f"Attitude and its tracking error, {air}", counterpart)
 
 
 def weights(flight: FlightData, air: str) -> Drawing | None:
@@ -192,7 +192,7 @@ def weights(flight: FlightData, air: str) -> Drawing | None:
         _time_axis(columns, flight.time_s)
         _legend(figure, columns[0])
 
-    return Drawing(_svg(draw, 2.5, "weights", _HALF_WIDTH_IN), f"PIDNN output weights, {air}", "", half=True)
+    return Drawing(svg(draw, 2.5, "weights", _HALF_WIDTH_IN), f"PIDNN output weights, {air}", "", half=True)
 
 
 def rotors(flight: FlightData, colour: str, air: str) -> Drawing | None:
@@ -230,7 +230,7 @@ def link(flight: FlightData, colour: str, air: str) -> Drawing | None:
         _time_axis((left, right), flight.time_s)
         _legend(figure, right)
 
-    return Drawing(_svg(draw, 2.3, "link", _HALF_WIDTH_IN), f"Link to the ground, {air}", "", half=True)
+    return Drawing(svg(draw, 2.3, "link", _HALF_WIDTH_IN), f"Link to the ground, {air}", "", half=True)
 
 
 def channels(flight: FlightData, air: str) -> Drawing | None:
@@ -259,7 +259,7 @@ def channels(flight: FlightData, air: str) -> Drawing | None:
         _legend(figure, top)
 
     caption = f"Off-board link: loss and delay (median, and dashed the 99th percentile) each second, {air}"
-    return Drawing(_svg(draw, 3.2, "channels"), caption, "")
+    return Drawing(svg(draw, 3.2, "channels"), caption, "")
 
 
 def _four(flight: FlightData, values: Array, colour: str, labels: list[str], *, share: bool, name: str) -> str:
@@ -271,7 +271,7 @@ def _four(flight: FlightData, values: Array, colour: str, labels: list[str], *, 
         _mark(grid.flat, flight)
         _time_axis(grid[1], flight.time_s)
 
-    return _svg(draw, 3.7, name, _HALF_WIDTH_IN)
+    return svg(draw, 3.7, name, _HALF_WIDTH_IN)
 
 
 def _track(path: Array) -> tuple[Array, Array, Array]:
@@ -365,7 +365,8 @@ def _legend(figure: Figure, axes: Any) -> None:
     figure.legend(handles, labels, loc="upper right", ncols=len(labels), borderaxespad=0.2)
 
 
-def _svg(draw: Callable[[Figure], None], height_in: float, name: str, width_in: float = _WIDTH_IN) -> str:
+def svg(draw: Callable[[Figure], None], height_in: float, name: str, width_in: float = _WIDTH_IN) -> str:
+    """What `draw` makes of an empty figure, in the house's style, for `with_ids` and a page."""
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure

@@ -6,7 +6,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from mavsitl.log.ulog import LogError
 from mavsitl.report import figures, metrics, tables
 from mavsitl.report.figures import CALM, WIND, Drawing
 from mavsitl.report.run import FlightRecord, Run, RunError, load_run
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 REPORT_FILE = "report.html"
 
@@ -115,15 +118,10 @@ def show(record: FlightRecord, data: FlightData) -> Shown:
 
 def render(run: Run, flights: list[Shown]) -> str:
     """The page as text."""
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["number"] = tables.number
-    source = resources.files("mavsitl.report").joinpath("template.html.j2").read_text("utf-8")
     groups = _groups(flights)
     sections = zip(_titles(groups), groups, strict=True)
     compared = [row for flight in flights for row in flight.rows if row.verdict is not None]
-    return environment.from_string(source).render(
+    return template("template.html.j2").render(
         run=run,
         sections=[_section(number, title, group) for number, (title, group) in enumerate(sections)],
         flights=flights,
@@ -132,6 +130,20 @@ def render(run: Run, flights: list[Shown]) -> str:
         oracles=[flight for flight in flights if flight.record.wind_information == "oracle"],
         symbols=tables.SYMBOLS,
     )
+
+
+def template(name: str) -> Template:
+    """One of this package's, with escaping on and the filter `number`."""
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    def read(name: str) -> str:
+        return resources.files("mavsitl.report").joinpath(name).read_text("utf-8")
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(read)
+    )
+    environment.filters["number"] = tables.number
+    return environment.get_template(name)
 
 
 def _load(run_folder: Path, record: FlightRecord) -> Shown:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from typing import Literal, TypeAlias
 
 from mavsitl.report.metrics import LABELS, PAPER_TABLES, UNITS, Rmse
@@ -88,7 +89,9 @@ def link_rows(links: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[Li
 
 
 def number(value: float) -> str:
-    """Three significant digits, plain where that is readable."""
+    """Three significant digits, plain where that is readable; ``lost`` for an infinite error."""
+    if value == inf:
+        return "lost"
     if 100.0 <= abs(value) < 1e4:
         return f"{value:.0f}"
     return f"{value:#.3g}" if 1e-3 <= abs(value) < 100.0 else f"{value:.2e}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -449,7 +450,7 @@ def wild_subject(value: float) -> Told:
         battery=pack,
         estimate=state,
         estimator_status=EstimatorStatus(True, True, True, True, False, *(value,) * 11),
-        accuracy=Accuracy(value, value, [value] * 21, [value] * 21),
+        accuracy=Accuracy(value, value, struct.pack("<21f", *[value] * 21), struct.pack("<21f", *[value] * 21)),
         specific_force_flu_m_s2=three,
         truth=(*state, *(min(max(value, -limit), limit),) * 4),
         true_wind=three,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from timeit import repeat
 
 import numpy as np
+from mavsitl_vehicle.plant.lanes import scratch
 from mavsitl_vehicle.plant.parameters import plant_parameters
 from mavsitl_vehicle.plant.state import Array, initial_state
 from mavsitl_vehicle.plant.step import rk4_step
@@ -19,9 +20,10 @@ CALLS = 20_000
 
 @compiled
 def cycles(calls: int, x: Array, command: Array, wind: Array, parameters: Array, held: NDArray[np.bool_]) -> None:
+    block = scratch(x.shape[1])
     for _ in range(calls):
         for _ in range(SUBSTEPS):
-            rk4_step(x, command, wind, parameters, 1.0e-3, held)
+            rk4_step(x, command, wind, parameters, 1.0e-3, held, block)
 
 
 def measure(name: str, n: int, flying: bool) -> float:

@@ -9,10 +9,13 @@ from collections.abc import Sequence
 from math import inf
 from pathlib import Path
 
+from mavsitl.campaign.fly import Row
+from mavsitl.campaign.grid import Overrides
+from mavsitl.campaign.summary import quantile
 from mavsitl.report.metrics import PAPER_TABLES
 from mavsitl.report.tables import number
 from tests.experiments import engine
-from tests.experiments.engine import Outcome, Overrides, quantile, table
+from tests.experiments.engine import table
 from tests.experiments.links import errors
 from tests.experiments.results import SEATS
 
@@ -34,13 +37,13 @@ ESTIMATORS: dict[str, Overrides] = {
 """RTK: centimetres, as an F9P's data sheet has them."""
 
 
-def median(outcomes: Sequence[Outcome]) -> tuple[float, float]:
+def median(outcomes: Sequence[Row]) -> tuple[float, float]:
     """Of the errors of position, m, and attitude, degrees."""
     position_m, attitude_deg = zip(*(errors(outcome) for outcome in outcomes), strict=True)
     return quantile(position_m, 0.5), quantile(attitude_deg, 0.5)
 
 
-def cell(outcomes: Sequence[Outcome], base: Sequence[Outcome]) -> str:
+def cell(outcomes: Sequence[Row], base: Sequence[Row]) -> str:
     """The median errors, each with its factor on those of `base`, and how many flights were lost."""
     found = median(outcomes)
     if found[0] == inf:
@@ -94,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         engine.job(case, SEATS[seat] | ESTIMATORS[kind] | extra, seed) for (case, seat, kind), seed in order
     ]  # fmt: skip
     outcomes = engine.campaign(jobs, workers=options.jobs, store=engine.store_of(options), title="estimators")
-    found: dict[tuple[str, str, str], list[Outcome]] = {key: [] for key in cells}
+    found: dict[tuple[str, str, str], list[Row]] = {key: [] for key in cells}
     for (key, _), outcome in zip(order, outcomes, strict=True):
         found[key].append(outcome)
     tables = []

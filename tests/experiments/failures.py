@@ -14,13 +14,16 @@ import msgspec
 import numpy as np
 
 from mavsitl import drivers, wings
+from mavsitl.campaign.fly import GRACE_S
+from mavsitl.campaign.grid import Case, Overrides
+from mavsitl.campaign.summary import quantile
 from mavsitl.log.flight import FlightData
 from mavsitl.log.ulog import MemoryRecorder
 from mavsitl.report.metrics import aftermath
 from mavsitl.report.tables import number
 from mavsitl.scenario import load
 from tests.experiments import engine
-from tests.experiments.engine import Job, Overrides, quantile, table
+from tests.experiments.engine import table
 from tests.experiments.results import SEATS
 
 OUTPUT = Path("docs") / "reference" / "rotor-failures.md"
@@ -50,12 +53,12 @@ class Fate(msgspec.Struct, frozen=True):
     """Distance from the reference where it came down, along the ground."""
 
 
-def fly(job: Job) -> Fate:
+def fly(job: Case) -> Fate:
     """One flight, in this process. Raises where it failed for another reason than its failure."""
     vehicle_log, ground_log = MemoryRecorder(), MemoryRecorder()
     vehicle = wings.find(wings.VEHICLE_GROUP)(job.flight, vehicle_log, seed=job.seed, lockstep=True)
     ground = wings.find(wings.GROUND_GROUP)(job.flight, ground_log)
-    drivers.fly_in_memory(vehicle, ground, max_time_s=job.flight.scenario.duration_s + engine.GRACE_S)
+    drivers.fly_in_memory(vehicle, ground, max_time_s=job.flight.scenario.duration_s + GRACE_S)
     if not (ground.succeeded or ground.lost):
         raise RuntimeError(f"{job.flight.name}, seed {job.seed}: ended in {ground.phase}")
     data = FlightData.from_recorders(vehicle_log, ground_log, duration_s=job.flight.scenario.duration_s)

@@ -11,9 +11,12 @@ from dataclasses import dataclass
 from math import hypot, inf, nan
 from pathlib import Path
 
+from mavsitl.campaign.fly import Row
+from mavsitl.campaign.grid import Case, Overrides
+from mavsitl.campaign.summary import quantile
 from mavsitl.scenario import Gains, load
 from tests.experiments import engine
-from tests.experiments.engine import Outcome, Overrides, quantile, table
+from tests.experiments.engine import table
 
 OUTPUT = Path("docs") / "explanation" / "learning.md"
 FIGURE = Path("figures") / "learning.svg"
@@ -59,16 +62,16 @@ def laws(scenario: str, case: str) -> dict[str, Overrides]:
     return made
 
 
-def tilt_deg(outcome: Outcome) -> float:
+def tilt_deg(outcome: Row) -> float:
     """RMS of the roll and pitch errors; infinite for a lost flight."""
     return inf if outcome.rmse is None else hypot(outcome.rmse[3], outcome.rmse[4])
 
 
-def yaw_deg(outcome: Outcome) -> float:
+def yaw_deg(outcome: Row) -> float:
     return inf if outcome.rmse is None else outcome.rmse[5]
 
 
-def position_m(outcome: Outcome) -> float:
+def position_m(outcome: Row) -> float:
     """RMS distance from the reference; infinite for a lost flight."""
     return inf if outcome.rmse is None else hypot(*outcome.rmse[:3])
 
@@ -92,7 +95,7 @@ class Comparison:
     weight_range: tuple[float, float]
 
 
-def compare(rotors: str, case: str, law: str, mine: Sequence[Outcome], pid: Sequence[Outcome]) -> Comparison:
+def compare(rotors: str, case: str, law: str, mine: Sequence[Row], pid: Sequence[Row]) -> Comparison:
     """`mine` and `pid` are the same seeds in the same order."""
     from scipy.stats import wilcoxon
 
@@ -147,9 +150,7 @@ EXPLANATION = """\
 """
 
 
-def page(
-    found: Sequence[Comparison], baselines: dict[tuple[str, str], list[Outcome]], options: argparse.Namespace
-) -> str:
+def page(found: Sequence[Comparison], baselines: dict[tuple[str, str], list[Row]], options: argparse.Namespace) -> str:
     seeds = len(engine.seeds_of(options))
     header = ("case", "law", "tilt", "yaw", "position", "tilt, quartiles", "p", "weights", "lost: law / PID")
     short = f" with `--quick`: flights of {engine.QUICK_S:g} s" if options.quick else ""
@@ -218,7 +219,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     scenarios = dict(list(SCENARIOS.items())[:1]) if options.quick else SCENARIOS
     extra: Overrides = {"duration_s": engine.QUICK_S} if options.quick else {}
     order: list[tuple[str, str, str]] = []
-    jobs: list[engine.Job] = []
+    jobs: list[Case] = []
     for rotors, scenario in scenarios.items():
         shown = ("nominal", "half bandwidth") if options.quick else tuple(cases(scenario))
         for case in shown:
@@ -226,7 +227,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 order += [(rotors, case, law)] * len(seeds)
                 jobs += [engine.job(scenario, cases(scenario)[case] | overrides | extra, seed) for seed in seeds]
     outcomes = engine.campaign(jobs, workers=options.jobs, store=engine.store_of(options), title="learning")
-    groups: dict[tuple[str, str, str], list[Outcome]] = {}
+    groups: dict[tuple[str, str, str], list[Row]] = {}
     for key, outcome in zip(order, outcomes, strict=True):
         groups.setdefault(key, []).append(outcome)
     found = [

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import msgspec
 
+from mavsitl.campaign.grid import Overrides
 from mavsitl.report.metrics import PAPER_TABLES
 from mavsitl.scenario import load, load_airframe
 from tests.experiments import engine
-from tests.experiments.engine import Overrides, table
+from tests.experiments.engine import table
 from tests.experiments.results import REALISTIC, SEATS, Number, numbers, ratio
 
 OUTPUT = Path("docs") / "explanation" / "limits.md"

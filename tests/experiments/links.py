@@ -10,9 +10,12 @@ from math import inf, sqrt
 from pathlib import Path
 from typing import Any
 
+from mavsitl.campaign.fly import Row
+from mavsitl.campaign.grid import Overrides
+from mavsitl.campaign.summary import quantile
 from mavsitl.report.tables import number
 from tests.experiments import engine
-from tests.experiments.engine import Outcome, Overrides, quantile, table
+from tests.experiments.engine import table
 from tests.experiments.results import SEATS
 
 OUTPUT = Path("docs") / "reference" / "links.md"
@@ -88,7 +91,7 @@ TABLES: dict[str, dict[str, Overrides]] = {"": LINKS, **SWEEPS, OFFBOARD_KEPT: W
 """By title; the first has none."""
 
 
-def errors(outcome: Outcome) -> tuple[float, float]:
+def errors(outcome: Row) -> tuple[float, float]:
     """RMSE of the position in space, m, and of the three angles together, degrees; infinite for a lost flight."""
     if outcome.rmse is None:
         return inf, inf
@@ -96,13 +99,13 @@ def errors(outcome: Outcome) -> tuple[float, float]:
     return sqrt(x * x + y * y + z * z), sqrt(phi * phi + theta * theta + psi * psi)
 
 
-def kept(outcomes: Sequence[Outcome]) -> str:
+def kept(outcomes: Sequence[Row]) -> str:
     """As `cell`, and in how many flights the vehicle left OFFBOARD."""
     left = sum(outcome.left_offboard > 0 for outcome in outcomes)
     return f"{cell(outcomes)}; {f'OFFBOARD left in {left} of {len(outcomes)}' if left else 'kept'}"
 
 
-def cell(outcomes: Sequence[Outcome]) -> str:
+def cell(outcomes: Sequence[Row]) -> str:
     """The median errors, and how many were lost."""
     position_m, attitude_deg = (
         quantile(values, 0.5) for values in zip(*(errors(outcome) for outcome in outcomes), strict=True)
@@ -170,7 +173,7 @@ def as_toml(overrides: Overrides) -> str:
     return "".join(f"{key} = {value:g}\n" for key, value in keys.items())
 
 
-def sweep(title: str, levels: Sequence[str], found: dict[tuple[str, str, str], list[Outcome]]) -> str:
+def sweep(title: str, levels: Sequence[str], found: dict[tuple[str, str, str], list[Row]]) -> str:
     columns = SWEEPS[title]
     rows = [[level, *(cell(found[title, column, level]) for column in columns)] for level in levels]
     return table((title, *columns), rows)
@@ -193,7 +196,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         link = TABLES[title][column]
         jobs.append(engine.job(CASE, WORSE_LEVELS[level] | link | extra, seed))
     outcomes = engine.campaign(jobs, workers=options.jobs, store=engine.store_of(options), title="links")
-    found: dict[tuple[str, str, str], list[Outcome]] = {key: [] for key in cells}
+    found: dict[tuple[str, str, str], list[Row]] = {key: [] for key in cells}
     for (key, _), outcome in zip(order, outcomes, strict=True):
         found[key].append(outcome)
     rows = [[link, *(cell(found["", link, level]) for level in LEVELS)] for link in LINKS]

@@ -14,11 +14,14 @@ from pathlib import Path
 
 import msgspec
 
+from mavsitl.campaign.fly import Row
+from mavsitl.campaign.grid import Overrides
+from mavsitl.campaign.summary import quantile
 from mavsitl.report.metrics import LABELS, PAPER_TABLES, UNITS
 from mavsitl.report.tables import number
 from mavsitl.scenario import load
 from tests.experiments import engine
-from tests.experiments.engine import Outcome, Overrides, quantile, table
+from tests.experiments.engine import table
 
 OUTPUT = Path("docs") / "reference" / "results.md"
 MET = 1.0 + 5e-4
@@ -91,7 +94,7 @@ def cells() -> list[Cell]:
     ]
 
 
-def numbers(outcomes: dict[str, list[Outcome]]) -> list[Number]:
+def numbers(outcomes: dict[str, list[Row]]) -> list[Number]:
     """The 24, from the outcomes of each of the paper's four cases."""
     made = []
     for case, paper in PAPER_TABLES.items():
@@ -110,7 +113,7 @@ def ratio(value: float) -> str:
     return text if value <= MET else f"**{text}**"
 
 
-def summary(results: dict[str, tuple[list[Number], list[Outcome]]]) -> str:
+def summary(results: dict[str, tuple[list[Number], list[Row]]]) -> str:
     rows = []
     for name, (found, outcomes) in results.items():
         worst = max(found, key=lambda each: each.ratio)
@@ -152,7 +155,7 @@ is what the shipped scenarios fly. The realistic airframe is flown with the cont
 """
 
 
-def page(results: dict[str, tuple[list[Number], list[Outcome]]], options: argparse.Namespace) -> str:
+def page(results: dict[str, tuple[list[Number], list[Row]]], options: argparse.Namespace) -> str:
     first, *others = results
     flown = f"{len(engine.seeds_of(options))}"
     short = f", flights of {engine.QUICK_S:g} s only (`--quick`: not comparable)" if options.quick else ""
@@ -168,7 +171,7 @@ def page(results: dict[str, tuple[list[Number], list[Outcome]]], options: argpar
         parts += [f"## {name}\n", ratios(results[name][0])]
     bad = [(name, outcome) for name, (_, outcomes) in results.items() for outcome in engine.failures(outcomes)]
     if bad:
-        counted: dict[tuple[str, str, str], list[Outcome]] = {}
+        counted: dict[tuple[str, str, str], list[Row]] = {}
         for name, outcome in bad:
             counted.setdefault((name, outcome.scenario, outcome.status), []).append(outcome)
         rows = [
@@ -180,7 +183,7 @@ def page(results: dict[str, tuple[list[Number], list[Outcome]]], options: argpar
     return "\n".join(parts)
 
 
-def _said(outcomes: Sequence[Outcome]) -> str:
+def _said(outcomes: Sequence[Row]) -> str:
     if outcomes[0].status == "lost":
         return ""
     return "; ".join(sorted({outcome.message.replace("|", "/") for outcome in outcomes}))
@@ -207,7 +210,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     order = [(cell, case, seed) for cell in chosen for case in PAPER_TABLES for seed in seeds]
     jobs = [engine.job(case, cell.overrides | extra, seed) for cell, case, seed in order]
     outcomes = engine.campaign(jobs, workers=options.jobs, store=engine.store_of(options), title="results")
-    results: dict[str, tuple[list[Number], list[Outcome]]] = {}
+    results: dict[str, tuple[list[Number], list[Row]]] = {}
     for cell in chosen:
         mine = {
             case: [o for (c, k, _), o in zip(order, outcomes, strict=True) if c is cell and k == case]

@@ -11,9 +11,12 @@ from math import hypot
 from pathlib import Path
 
 from mavsitl import scenario as scenarios
+from mavsitl.campaign.fly import Row
+from mavsitl.campaign.grid import Case, Overrides
+from mavsitl.campaign.summary import quantile
 from mavsitl.scenario import Flight
 from tests.experiments import engine
-from tests.experiments.engine import Outcome, Overrides, quantile, table
+from tests.experiments.engine import table
 
 OUTPUT = Path("docs") / "explanation" / "stability.md"
 HOUR_S = 3600.0
@@ -36,7 +39,7 @@ def printed(rate: float, bound: str, delta: str) -> Overrides:
     }
 
 
-def shipped_row(label: str, flight: Flight, outcomes: Sequence[Outcome]) -> list[str]:
+def shipped_row(label: str, flight: Flight, outcomes: Sequence[Row]) -> list[str]:
     """The worst of the seeds."""
     held = [outcome for outcome in outcomes if outcome.flown]
     learns = flight.scenario.controller.law == "pidnn"
@@ -52,7 +55,7 @@ def shipped_row(label: str, flight: Flight, outcomes: Sequence[Outcome]) -> list
     return cells
 
 
-def printed_row(case: tuple[str, float, str, str], outcomes: Sequence[Outcome]) -> list[str]:
+def printed_row(case: tuple[str, float, str, str], outcomes: Sequence[Row]) -> list[str]:
     rotors, rate, bound, delta = case
     times = [o.time_s if not o.flown else float("inf") for o in outcomes]
     diverged = sum(not o.flown for o in outcomes)
@@ -89,8 +92,8 @@ from the reference: the attitude is gone some seconds before.
 
 
 def page(
-    shipped: dict[str, list[Outcome]],
-    unguarded: dict[tuple[str, float, str, str], list[Outcome]],
+    shipped: dict[str, list[Row]],
+    unguarded: dict[tuple[str, float, str, str], list[Row]],
     flights: dict[str, Flight],
     duration_s: float,
     options: argparse.Namespace,
@@ -143,7 +146,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     names = ["hover-wind"] if options.quick else scenarios.names()
     rotors = list(PRINTED_SCENARIOS)[:1] if options.quick else list(PRINTED_SCENARIOS)
     printed_seeds = engine.seeds_of(options) if options.quick else range(1, 1 + options.printed_seeds)
-    groups: list[tuple[str | tuple[str, float, str, str], list[engine.Job]]] = []
+    groups: list[tuple[str | tuple[str, float, str, str], list[Case]]] = []
     flown: list[tuple[str, str, Overrides]] = [(name, name, {}) for name in names]
     for label, name, changes in (*flown, WHOLE_FORCE):
         groups.append((label, [engine.job(name, changes | extra, seed) for seed in engine.seeds_of(options)]))
@@ -158,8 +161,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     outcomes = iter(
         engine.campaign(everything, workers=options.jobs, store=engine.store_of(options), title="stability")
     )
-    shipped: dict[str, list[Outcome]] = {}
-    unguarded: dict[tuple[str, float, str, str], list[Outcome]] = {}
+    shipped: dict[str, list[Row]] = {}
+    unguarded: dict[tuple[str, float, str, str], list[Row]] = {}
     for key, jobs in groups:
         ended = [next(outcomes) for _ in jobs]
         if isinstance(key, str):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from mavsitl.campaign.fly import Row
 from mavsitl.report.metrics import PAPER_TABLES
 from tests.bench import bench_estimator
 from tests.experiments import estimators
-from tests.experiments.engine import Outcome
 
 
 def test_estimators_has_every_experiment_and_kind(capsys: pytest.CaptureFixture[str]) -> None:
@@ -22,10 +22,10 @@ def test_estimators_has_every_experiment_and_kind(capsys: pytest.CaptureFixture[
 
 
 def test_a_cell_tells_the_factor_and_the_losses() -> None:
-    def flown(size: float) -> list[Outcome]:
-        return [Outcome("", "hover-wind", seed, "flown", 60.0, (0.0, 0.0, size, 0.0, 0.0, size)) for seed in (1, 2)]
+    def flown(size: float) -> list[Row]:
+        return [Row("", "hover-wind", seed, "flown", 60.0, (0.0, 0.0, size, 0.0, 0.0, size)) for seed in (1, 2)]
 
-    lost = Outcome("", "hover-wind", 3, "lost", 3.0)
+    lost = Row("", "hover-wind", 3, "lost", 3.0)
     base = flown(0.2)
     assert estimators.cell(base, base) == "0.200 m, 0.200°"
     assert estimators.cell(flown(0.5), base) == "0.500 m (x 2.5), 0.500° (x 2.5)"

@@ -2,105 +2,18 @@
 
 from __future__ import annotations
 
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
-from mavsitl import wings
-from mavsitl.drivers import fly_in_memory
-from mavsitl.log.flight import FlightData
-from mavsitl.log.ulog import MemoryRecorder
-from mavsitl.report.metrics import PAPER_TABLES, maximum_error, rmse
-from tests.bench import bench_lockstep
+from mavsitl.campaign.fly import Row, fly
+from mavsitl.report.metrics import PAPER_TABLES
 from tests.experiments import engine, failures, learning, limits, links, results, stability
-from tests.experiments.engine import Job, Outcome
-from tests.experiments.sums import first_weights
 
 SHORT: dict[str, Any] = {"duration_s": 2.0}
-
-
-@pytest.mark.parametrize("name", ["spiral-wind", "takeoff-hover"])
-def test_running_sums_are_the_measures_of_the_whole_log(name: str) -> None:
-    job = engine.job(name, SHORT, 5)
-    vehicle_log, ground_log = MemoryRecorder(), MemoryRecorder()
-    vehicle = wings.find(wings.VEHICLE_GROUP)(job.flight, vehicle_log, seed=5, lockstep=True)
-    fly_in_memory(vehicle, wings.find(wings.GROUND_GROUP)(job.flight, ground_log))
-    logged = FlightData.from_recorders(vehicle_log, ground_log, duration_s=2.0)
-    outcome = engine.fly(job)
-    assert outcome.status == "flown"
-    assert outcome.rmse == pytest.approx(rmse(logged).values(), rel=1e-5, abs=1e-6)
-    assert outcome.largest == pytest.approx(maximum_error(logged).values(), rel=1e-4, abs=1e-5)
-    assert logged.weights is not None
-    ratios = logged.weights / first_weights(job.flight)
-    assert outcome.weight_range == pytest.approx((ratios.min(), ratios.max()), rel=1e-6)
-    assert ratios.min() < 1.0 < ratios.max()
-
-
-def test_a_lost_flight_is_stopped_and_timed() -> None:
-    outcome = engine.fly(engine.job("hover-wind", {"offnominal.rotor_thrust_scale": [0.0, 1.0, 1.0, 1.0]}, 1))
-    assert outcome.status == "lost"
-    assert outcome.rmse is None
-    assert 1.0 < outcome.time_s < 10.0
-
-
-def test_a_flight_that_raises_is_an_outcome_with_its_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    def find(group: str) -> Any:
-        raise LookupError(f"nobody sits at {group}")
-
-    monkeypatch.setattr(wings, "find", find)
-    outcome = engine.fly(engine.job("hover-calm", SHORT, 1))
-    assert (outcome.status, outcome.message) == ("failed", "LookupError: nobody sits at mavsitl.vehicle")
-
-
-def test_keys_tell_scenario_and_seed_apart() -> None:
-    jobs = [
-        engine.job(name, ov, seed) for name in ("hover-calm", "hover-wind") for ov in ({}, SHORT) for seed in (1, 2)
-    ]
-    assert len({job.key for job in jobs}) == len(jobs)
-    assert engine.job("hover-calm", SHORT, 1).key == engine.job("hover-calm", dict(SHORT), 1).key
-
-
-def test_an_interrupted_campaign_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = tmp_path / "store" / "outcomes.jsonl"
-    jobs = [engine.job("hover-calm", SHORT, seed) for seed in (1, 2, 3)]
-    flown: list[int] = []
-
-    def fly(job: Job) -> Outcome:
-        flown.append(job.seed)
-        return Outcome(job.key, job.flight.name, job.seed, "flown", 2.0, (float(job.seed),) * 6)
-
-    monkeypatch.setattr(engine, "fly", fly)
-    before = engine.campaign(jobs, workers=1, store=store, title="", show=False)
-    assert flown == [1, 2, 3]
-    whole = store.read_bytes()
-    store.write_bytes(whole[:-20])  # the third line cut off, as by an interruption
-    after = engine.campaign(jobs, workers=1, store=store, title="", show=False)
-    assert flown == [1, 2, 3, 3]
-    assert after == before
-    assert store.read_bytes() == whole
-
-
-def test_a_damaged_store_is_refused_by_line(tmp_path: Path) -> None:
-    store = tmp_path / "outcomes.jsonl"
-    store.write_text('{"key": 3}\n')
-    with pytest.raises(ValueError, match=r"outcomes\.jsonl: line 1 is no outcome"):
-        engine.Store(store)
-
-
-def test_the_pool_gives_what_one_process_gives() -> None:
-    jobs = [engine.job("hover-wind", SHORT, seed) for seed in (1, 2)]
-    pooled = engine.campaign(jobs, workers=2, store=None, title="", show=False)
-    assert pooled == [engine.fly(job) for job in jobs]
-
-
-def test_quantiles_count_lost_flights_as_the_worst() -> None:
-    assert engine.quantile([3.0, 1.0, 2.0, 4.0], 0.5) == 2.5
-    assert engine.quantile([inf, 1.0, 2.0], 0.5) == 2.0
-    assert engine.quantile([inf, 1.0], 0.5) == inf
-    assert engine.quantile([inf, inf], 0.25) == inf
 
 
 def test_results_has_24_numbers_of_the_default_cell(capsys: pytest.CaptureFixture[str]) -> None:
@@ -125,11 +38,11 @@ def test_results_has_every_cell_and_the_default_one_first() -> None:
 
 
 def test_results_marks_what_is_missed_and_what_was_lost() -> None:
-    exact = {case: [Outcome("", case, 1, "flown", 60.0, paper.values())] for case, paper in PAPER_TABLES.items()}
+    exact = {case: [Row("", case, 1, "flown", 60.0, paper.values())] for case, paper in PAPER_TABLES.items()}
     assert all(number.met for number in results.numbers(exact))
     x, *others = PAPER_TABLES["hover-wind"].values()
     exact["hover-wind"] = [msgspec.structs.replace(exact["hover-wind"][0], rmse=(2.0 * x, *others))]
-    exact["spiral-calm"] = [Outcome("", "spiral-calm", 1, "lost", 3.0)]
+    exact["spiral-calm"] = [Row("", "spiral-calm", 1, "lost", 3.0)]
     found = results.numbers(exact)
     assert [number.name for number in found if not number.met][:2] == ["hover-wind x", "spiral-calm x"]
     assert "**2.00**" in results.absolute(found)
@@ -155,9 +68,9 @@ def test_learning_writes_its_page_and_figure(tmp_path: Path) -> None:
 
 
 def test_learning_pairs_seeds_and_leaves_lost_ones_out() -> None:
-    def outcome(seed: int, tilt: float | None) -> Outcome:
+    def outcome(seed: int, tilt: float | None) -> Row:
         values = None if tilt is None else (3.0, 4.0, 0.0, tilt, 0.0, 1.0)
-        return Outcome("", "hover-wind", seed, "flown" if values else "lost", 60.0, values, None, (0.5, 1.5))
+        return Row("", "hover-wind", seed, "flown" if values else "lost", 60.0, values, None, (0.5, 1.5))
 
     mine = [outcome(1, 1.0), outcome(2, 3.0), outcome(3, None)]
     pid = [outcome(1, 2.0), outcome(2, 4.0), outcome(3, 1.0)]
@@ -185,7 +98,7 @@ def test_stability_shows_both_laws(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_stability_shows_when_a_law_diverged() -> None:
-    lost = [Outcome("", "hover-wind", seed, "lost", 100.0 * seed, None, None, (1.0, 9.0)) for seed in (1, 2, 3)]
+    lost = [Row("", "hover-wind", seed, "lost", 100.0 * seed, None, None, (1.0, 9.0)) for seed in (1, 2, 3)]
     row = stability.printed_row(("ideal rotors", 10.0, "printed", "known"), lost)
     assert row[4:] == ["3 of 3", "100", "200", "300", "9"]
 
@@ -201,21 +114,17 @@ def test_limits_changes_one_thing_at_a_time(capsys: pytest.CaptureFixture[str]) 
     assert len(rows) == len(limits.cases()) + 3
 
 
-def test_the_rival_of_the_benchmark_hovers() -> None:
-    assert isfinite(bench_lockstep.fly_rival(0.5))
-
-
 def test_a_link_does_not_change_what_is_measured() -> None:
     """Channels that do nothing leave the sums as they are; what the ground does not hear of is measured, too."""
-    perfect = engine.fly(engine.job("hover-wind", SHORT, 1))
-    through = engine.fly(engine.job("hover-wind", SHORT | links.both(queue_bytes=9000), 1))
+    perfect = fly(engine.job("hover-wind", SHORT, 1))
+    through = fly(engine.job("hover-wind", SHORT | links.both(queue_bytes=9000), 1))
     assert through.flown
     assert through.rmse == perfect.rmse
     silent = {"duration_s": 4.0, "link.to_vehicle.loss": 1.0, "link.to_ground.loss": 0.0}
-    assert engine.fly(engine.job("hover-wind", silent, 1)).status == "failed"  # never armed
+    assert fly(engine.job("hover-wind", silent, 1)).status == "failed"  # never armed
     outage = [{"start_s": 1.0, "duration_s": 1000.0}]
     gone = SHORT | {"duration_s": 60.0, "controller.level": "torque"} | links.both(outages=outage)
-    lost = engine.fly(engine.job("hover-wind", gone, 1))
+    lost = fly(engine.job("hover-wind", gone, 1))
     assert lost.status == "lost"
     assert lost.largest is not None
     assert max(map(abs, lost.largest)) > 1.0
@@ -250,8 +159,8 @@ def test_failures_measures_a_fall_and_a_flight() -> None:
 
 
 def test_links_counts_lost_flights_beside_the_median() -> None:
-    flown = [Outcome("", "hover-wind", seed, "flown", 60.0, (0.3, 0.4, 0.0, 0.0, 3.0, 4.0)) for seed in (1, 2)]
-    lost = Outcome("", "hover-wind", 3, "lost", 3.0)
+    flown = [Row("", "hover-wind", seed, "flown", 60.0, (0.3, 0.4, 0.0, 0.0, 3.0, 4.0)) for seed in (1, 2)]
+    lost = Row("", "hover-wind", 3, "lost", 3.0)
     assert links.cell(flown) == "0.500 m, 5.00°"
     assert links.cell([*flown, lost]) == "0.500 m, 5.00° (1 of 3 lost)"
     assert links.cell([flown[0], lost, lost]) == "lost"

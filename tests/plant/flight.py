@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 from mavsitl_vehicle.plant import parameters as rows
 from mavsitl_vehicle.plant.body import body_derivative
-from mavsitl_vehicle.plant.parameters import plant_parameters
+from mavsitl_vehicle.plant.lanes import scratch
+from mavsitl_vehicle.plant.parameters import parameters_of, plant_parameters
 from mavsitl_vehicle.plant.state import Array, Body, Rotors, initial_state
-from mavsitl_vehicle.plant.step import linear_acceleration, rk4_step
+from mavsitl_vehicle.plant.step import linear_acceleration, rk4_step, wind_of
 
 from mavsitl.airframes import Airframe
 from mavsitl.scenario import Offnominal, load_airframe
@@ -43,10 +44,11 @@ class Fleet:
         self.command = np.full((4, n), rotor_speed_rad_s)
 
     def run(self, seconds: float, dt_s: float = 1.0e-3, command: Callable[[float], Array] | None = None) -> None:
+        block = scratch(self.x.shape[1])
         for k in range(round(seconds / dt_s)):
             if command is not None:
                 self.command[:] = command(k * dt_s)
-            rk4_step(self.x, self.command, self.wind, self.parameters, dt_s, self.held)
+            rk4_step(self.x, self.command, self.wind, self.parameters, dt_s, self.held, block)
 
     def acceleration(self) -> Array:
         out = np.empty((3, self.x.shape[1]))
@@ -61,7 +63,7 @@ def body_slope(fleet: Fleet, body: Sequence[float], rotors: Sequence[float] | Ar
     """`body_derivative` of the fleet's first vehicle: 13 rows in, 13 out, in the fleet's wind."""
     state = cast("Body", tuple(float(value) for value in body))
     speeds = cast("Rotors", tuple(float(value) for value in rotors))
-    return np.array(list(body_derivative(state, speeds, fleet.wind, fleet.parameters, 0)))
+    return np.array(list(body_derivative(state, speeds, wind_of(fleet.wind, 0), parameters_of(fleet.parameters, 0))))
 
 
 def rotation(q: Array) -> Array:

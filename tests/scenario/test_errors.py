@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavsitl import scenario
-from mavsitl.scenario import ScenarioError
+from mavsitl.scenario import DrydenPaper, ScenarioError, Steps
 
 LAW = "controller.law: 'lqr' is not allowed; allowed: 'pid', 'pidnn'"
 MODELS = "'steady', 'gust', 'dryden-paper', 'dryden-mil'"
@@ -109,10 +109,10 @@ REFUSED = {
     "unknown reference": ('[reference]\nkind = "loop"', f"reference.kind: 'loop' is not allowed; allowed: {KINDS}"),
     "missing wind key": (
         '[[wind]]\nmodel = "dryden-mil"\naltitude_m = 6',
-        "wind[0].wind_speed_20ft_m_s: missing; allowed: number > 0",
+        "wind[0].speed_20ft_m_s: missing; allowed: number >= 0",
     ),
     "above the model's range": (
-        '[[wind]]\nmodel = "dryden-mil"\nwind_speed_20ft_m_s = 5\naltitude_m = 400',
+        '[[wind]]\nmodel = "dryden-mil"\nspeed_20ft_m_s = 5\naltitude_m = 400',
         "wind[0].altitude_m: 400 is not allowed; allowed: number > 0 and <= 304.8",
     ),
     "unknown law": ('[controller]\nlaw = "lqr"', LAW),
@@ -293,12 +293,34 @@ def test_a_file_that_is_not_toml(tmp_path: Path, text: str) -> None:
         ("controller.lawn", "pid", "controller.lawn: unknown key; allowed here: law, level,"),
         ("title.size", 1, "title.size: 'title' is not a table, so it has no key to set"),
         ("duration_s", float("nan"), "duration_s: nan is not allowed; allowed: number > 0"),
+        ("start[0].clamp", True, "start[0].clamp: 'start' is no array, so it has no element 0"),
+        ("start[x].clamp", True, "start[x].clamp: 'start[x]' is no part of a key; allowed: NAME or NAME[0]"),
     ],
 )
 def test_overrides_are_held_to_the_same_rules(key: str, value: object, message: str) -> None:
     with pytest.raises(ScenarioError) as refusal:
         scenario.load("hover-calm", {key: value})
     assert str(refusal.value).startswith(f"hover-calm (shipped): {message}")
+
+
+def test_overrides_reach_into_arrays_of_tables(tmp_path: Path) -> None:
+    """By the index, as messages have it, or without where there is one alone."""
+    one = scenario.load("hover-wind", {"wind.speed_20ft_m_s": 3.0})
+    assert one.scenario.wind == scenario.load("hover-wind", {"wind[0].speed_20ft_m_s": 3.0}).scenario.wind
+    assert one.scenario.wind == (DrydenPaper(speed_20ft_m_s=3.0),)
+    steps = scenario.load("steps-calm", {"reference.steps[1].yaw_deg": 12.0}).scenario.reference
+    assert isinstance(steps, Steps)
+    assert [step.yaw_deg == 12.0 for step in steps.steps].index(True) == 1
+    text = 'title = "Calm"\nwind = []\n'
+    (tmp_path / "calm.toml").write_text(text)
+    for name, key, message in (
+        ("steps-calm", "reference.steps.yaw_deg", "'reference.steps' has 6 element(s); allowed: reference.steps[0],"),
+        ("hover-wind", "wind[1].altitude_m", "'wind' has 1 element(s); allowed: wind[0]"),
+        (str(tmp_path / "calm.toml"), "wind.altitude_m", "'wind' is empty, so it has no element to set"),
+    ):
+        with pytest.raises(ScenarioError) as refusal:
+            scenario.load(name, {key: 1.0})
+        assert f": {key}: {message}" in str(refusal.value)
 
 
 KEYS = [

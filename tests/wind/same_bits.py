@@ -15,7 +15,7 @@ EVERYTHING = (
     Gust(velocity_nwu_m_s=(-2.0, 1.0, 0.5), start_s=0.0, length_s=0.3, shape="ramp"),
     DrydenPaper(),
     DrydenPaper(form="spectrum", intensity="unit"),
-    DrydenMil(wind_speed_20ft_m_s=7.0, altitude_m=2.0, from_deg=40.0, include_mean=True),
+    DrydenMil(speed_20ft_m_s=7.0, altitude_m=2.0, from_deg=40.0, include_mean=True),
 )
 
 

@@ -19,7 +19,7 @@ from tests.wind.turbulence import blow
 FIRST_ORDER = DrydenPaper()
 SPECTRUM = DrydenPaper(form="spectrum")
 UNIT = DrydenPaper(intensity="unit")
-MIL = DrydenMil(wind_speed_20ft_m_s=10.0, altitude_m=1.0)
+MIL = DrydenMil(speed_20ft_m_s=10.0, altitude_m=1.0)
 
 
 def sigmas(wind: DrydenPaper | DrydenMil) -> list[float]:
@@ -48,14 +48,14 @@ def test_mil_by_hand() -> None:
 
 def test_mil_at_the_top_is_isotropic() -> None:
     """1,000 ft: 0.177 + 0.823 = 1, so every L is 1,000 ft (L_u = 2 L_v = 2 L_w) and every sigma is 0.1 u20."""
-    scales = dryden.mil_scales(DrydenMil(wind_speed_20ft_m_s=20.0, altitude_m=304.8))
+    scales = dryden.mil_scales(DrydenMil(speed_20ft_m_s=20.0, altitude_m=304.8))
     assert scales.length_m == pytest.approx((304.8, 152.4, 152.4))
     assert scales.sigma_m_s == pytest.approx((2.0, 2.0, 2.0))
 
 
 def test_mean_wind_is_u20_at_20_feet_and_has_a_floor() -> None:
-    assert dryden.mil_mean_speed_m_s(DrydenMil(wind_speed_20ft_m_s=7.0, altitude_m=6.096)) == pytest.approx(7.0)
-    low = [dryden.mil_mean_speed_m_s(DrydenMil(wind_speed_20ft_m_s=7.0, altitude_m=h)) for h in (0.01, 0.9144)]
+    assert dryden.mil_mean_speed_m_s(DrydenMil(speed_20ft_m_s=7.0, altitude_m=6.096)) == pytest.approx(7.0)
+    low = [dryden.mil_mean_speed_m_s(DrydenMil(speed_20ft_m_s=7.0, altitude_m=h)) for h in (0.01, 0.9144)]
     assert low[0] == low[1] > 0.0
 
 
@@ -183,7 +183,7 @@ def test_memory_over_time() -> None:
 @pytest.mark.parametrize(("from_deg", "towards"), [(0.0, (-1, 0, 0)), (90.0, (0, 1, 0)), (225.0, (0.7071, -0.7071, 0))])
 def test_mil_mean_wind_goes_where_it_does_not_come_from(from_deg: float, towards: tuple[float, ...]) -> None:
     """From the east it blows west, +y; from the south-west to the north-east, +x and -y."""
-    wind = DrydenMil(wind_speed_20ft_m_s=5.0, altitude_m=6.096, from_deg=from_deg, include_mean=True)
+    wind = DrydenMil(speed_20ft_m_s=5.0, altitude_m=6.096, from_deg=from_deg, include_mean=True)
     field = WindField((wind,), 1, 0.01)
     out = np.empty((3, 1))
     field.step(0.0, np.zeros((5, 1)), out)
@@ -194,7 +194,7 @@ def test_mil_turbulence_turns_with_the_wind() -> None:
     """At 1 m, L_u = 2 L_v: turned by 90 degrees u lies along y. Told apart by their memory after 2 s."""
     n = 20_000
     for from_deg, axis_u, axis_v in ((0.0, 0, 1), (90.0, 1, 0)):
-        wind: Wind = DrydenMil(wind_speed_20ft_m_s=10.0, altitude_m=1.0, from_deg=from_deg)
+        wind: Wind = DrydenMil(speed_20ft_m_s=10.0, altitude_m=1.0, from_deg=from_deg)
         samples = blow((wind,), n, 1.0, 3)
         u = np.corrcoef(samples[0, axis_u], samples[2, axis_u])[0, 1]
         v = np.corrcoef(samples[0, axis_v], samples[2, axis_v])[0, 1]

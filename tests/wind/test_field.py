@@ -56,7 +56,7 @@ def test_a_third_of_the_way_up_is_a_quarter() -> None:
 
 def test_a_sum_is_the_sum_of_its_parts() -> None:
     paper = DrydenPaper()
-    mil = DrydenMil(wind_speed_20ft_m_s=6.0, altitude_m=3.0, from_deg=30.0, include_mean=True)
+    mil = DrydenMil(speed_20ft_m_s=6.0, altitude_m=3.0, from_deg=30.0, include_mean=True)
     steady = Steady(velocity_nwu_m_s=(1.0, 0.0, -0.5))
     field = WindField((paper, steady, mil), 3, 0.01)
     assert field.normals_per_step == 3 + 5
@@ -115,3 +115,16 @@ def test_unjitted_is_jitted() -> None:
 
 def test_equal_seeds_equal_wind() -> None:
     np.testing.assert_array_equal(blow((DrydenPaper(),), 2, 0.01, 5), blow((DrydenPaper(),), 2, 0.01, 5))
+
+
+def test_turbulence_of_no_wind_is_calm_and_draws_nothing() -> None:
+    """The lower end of a sweep over the wind's speed."""
+    winds: tuple[Wind, ...] = (
+        DrydenPaper(speed_20ft_m_s=0.0),
+        DrydenMil(speed_20ft_m_s=0.0, altitude_m=6.0, include_mean=True),
+    )
+    field = WindField(winds, 1, 0.001)
+    assert field.normals_per_step == 0
+    assert field.coefficients.shape[0] == 0
+    alone = WindField((DrydenPaper(),), 1, 0.001)
+    assert np.array_equal(WindField((*winds, DrydenPaper()), 1, 0.001).coefficients, alone.coefficients)

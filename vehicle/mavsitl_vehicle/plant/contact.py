@@ -8,8 +8,9 @@ LEG_HEIGHT above it. Nothing but the leg tips touches the ground.
 from __future__ import annotations
 
 from math import sqrt
+from typing import TypeAlias
 
-from mavsitl.compiled import compiled
+from mavsitl_vehicle.plant.inlined import inlined
 from mavsitl_vehicle.plant.parameters import (
     CONTACT_DAMPING,
     CONTACT_SINK_M,
@@ -18,16 +19,22 @@ from mavsitl_vehicle.plant.parameters import (
     INVERSE_MASS,
     LEG_HEIGHT,
     LEG_RADIUS,
+    Column,
 )
-from mavsitl_vehicle.plant.state import Array, Body
+from mavsitl_vehicle.plant.state import Body
 
 FRICTION = 0.7
 """Coefficient of sliding friction."""
 FRICTION_SPEED_M_S = 0.05
 """Friction is FRICTION N v / sqrt(v^2 + this^2): viscous well below this speed, Coulomb's well above."""
 
+Rotation: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+"""R of eq 6, row by row: body FLU to world NWU."""
+Wrench: TypeAlias = tuple[float, float, float, float, float, float]
+"""Force, N NWU, and moment about the mass centre, N m FLU."""
 
-@compiled
+
+@inlined
 def leg_force(depth_m: float, sink_speed_m_s: float, stiffness: float, damping: float) -> float:
     """Normal force of one leg, N, for its depth below the ground and the speed at which that grows."""
     if depth_m <= 0.0:
@@ -41,67 +48,70 @@ def leg_force(depth_m: float, sink_speed_m_s: float, stiffness: float, damping: 
     return force
 
 
-@compiled
-def contact_derivative(body: Body, parameters: Array, j: int) -> tuple[float, float, float, float, float, float]:
-    """What the ground adds to vehicle `j`'s accelerations: linear (m/s^2 NWU) and angular (rad/s^2 FLU)."""
-    _, _, height, body_vx, body_vy, body_vz, qw, qx, qy, qz, p, q, r = body
-    r_xx = 1.0 - 2.0 * (qy * qy + qz * qz)
-    r_xy = 2.0 * (qx * qy - qw * qz)
-    r_xz = 2.0 * (qx * qz + qw * qy)
-    r_yx = 2.0 * (qx * qy + qw * qz)
-    r_yy = 1.0 - 2.0 * (qx * qx + qz * qz)
-    r_yz = 2.0 * (qy * qz - qw * qx)
-    r_zx = 2.0 * (qx * qz - qw * qy)
-    r_zy = 2.0 * (qy * qz + qw * qx)
-    r_zz = 1.0 - 2.0 * (qx * qx + qy * qy)
+@inlined
+def with_leg(others: Wrench, leg_x: float, leg_y: float, body: Body, rotation: Rotation, parameters: Column) -> Wrench:
+    """`others` and what the ground does to one more leg, its tip at `leg_x`, `leg_y` in the body."""
+    force_x, force_y, force_z, moment_x, moment_y, moment_z = others
+    _, _, height, body_vx, body_vy, body_vz, _, _, _, _, p, q, r = body
+    r_xx, r_xy, r_xz, r_yx, r_yy, r_yz, r_zx, r_zy, r_zz = rotation
+    centre_z = height + parameters[LEG_HEIGHT]
+    leg_z = -(parameters[LEG_HEIGHT] + CONTACT_SINK_M)
+    depth = -(centre_z + r_zx * leg_x + r_zy * leg_y + r_zz * leg_z)
 
-    centre_z = height + parameters[LEG_HEIGHT, j]
-    leg_z = -(parameters[LEG_HEIGHT, j] + CONTACT_SINK_M)
-    force_x = force_y = force_z = 0.0
-    moment_x = moment_y = moment_z = 0.0
-    for leg in range(4):
-        # Rear, right, front, left, as the rotors.
-        leg_x = leg_y = 0.0
-        if leg == 0:
-            leg_x = -parameters[LEG_RADIUS, j]
-        elif leg == 1:
-            leg_y = -parameters[LEG_RADIUS, j]
-        elif leg == 2:
-            leg_x = parameters[LEG_RADIUS, j]
-        else:
-            leg_y = parameters[LEG_RADIUS, j]
-        depth = -(centre_z + r_zx * leg_x + r_zy * leg_y + r_zz * leg_z)
+    # The tip's velocity: v + R (omega x leg).
+    spin_x = q * leg_z - r * leg_y
+    spin_y = r * leg_x - p * leg_z
+    spin_z = p * leg_y - q * leg_x
+    v_x = body_vx + r_xx * spin_x + r_xy * spin_y + r_xz * spin_z
+    v_y = body_vy + r_yx * spin_x + r_yy * spin_y + r_yz * spin_z
+    v_z = body_vz + r_zx * spin_x + r_zy * spin_y + r_zz * spin_z
 
-        # The tip's velocity: v + R (omega x leg).
-        spin_x = q * leg_z - r * leg_y
-        spin_y = r * leg_x - p * leg_z
-        spin_z = p * leg_y - q * leg_x
-        v_x = body_vx + r_xx * spin_x + r_xy * spin_y + r_xz * spin_z
-        v_y = body_vy + r_yx * spin_x + r_yy * spin_y + r_yz * spin_z
-        v_z = body_vz + r_zx * spin_x + r_zy * spin_y + r_zz * spin_z
+    normal = leg_force(depth, -v_z, parameters[CONTACT_STIFFNESS], parameters[CONTACT_DAMPING])
+    drag = FRICTION * normal / sqrt(v_x * v_x + v_y * v_y + FRICTION_SPEED_M_S * FRICTION_SPEED_M_S)
+    f_x = -drag * v_x
+    f_y = -drag * v_y
 
-        normal = leg_force(depth, -v_z, parameters[CONTACT_STIFFNESS, j], parameters[CONTACT_DAMPING, j])
-        drag = FRICTION * normal / sqrt(v_x * v_x + v_y * v_y + FRICTION_SPEED_M_S * FRICTION_SPEED_M_S)
-        f_x = -drag * v_x
-        f_y = -drag * v_y
-        force_x += f_x
-        force_y += f_y
-        force_z += normal
-
-        # The moment in the body: leg x (R^T f).
-        b_x = r_xx * f_x + r_yx * f_y + r_zx * normal
-        b_y = r_xy * f_x + r_yy * f_y + r_zy * normal
-        b_z = r_xz * f_x + r_yz * f_y + r_zz * normal
-        moment_x += leg_y * b_z - leg_z * b_y
-        moment_y += leg_z * b_x - leg_x * b_z
-        moment_z += leg_x * b_y - leg_y * b_x
-
-    per_mass = parameters[INVERSE_MASS, j]
+    # The moment in the body: leg x (R^T f).
+    b_x = r_xx * f_x + r_yx * f_y + r_zx * normal
+    b_y = r_xy * f_x + r_yy * f_y + r_zy * normal
+    b_z = r_xz * f_x + r_yz * f_y + r_zz * normal
     return (
-        force_x * per_mass,
-        force_y * per_mass,
-        force_z * per_mass,
-        moment_x * parameters[INVERSE_INERTIA, j],
-        moment_y * parameters[INVERSE_INERTIA + 1, j],
-        moment_z * parameters[INVERSE_INERTIA + 2, j],
+        force_x + f_x,
+        force_y + f_y,
+        force_z + normal,
+        moment_x + (leg_y * b_z - leg_z * b_y),
+        moment_y + (leg_z * b_x - leg_x * b_z),
+        moment_z + (leg_x * b_y - leg_y * b_x),
+    )
+
+
+@inlined
+def contact_derivative(body: Body, parameters: Column) -> Wrench:
+    """What the ground adds to a vehicle's accelerations: linear (m/s^2 NWU) and angular (rad/s^2 FLU)."""
+    _, _, _, _, _, _, qw, qx, qy, qz, _, _, _ = body
+    rotation = (
+        1.0 - 2.0 * (qy * qy + qz * qz),
+        2.0 * (qx * qy - qw * qz),
+        2.0 * (qx * qz + qw * qy),
+        2.0 * (qx * qy + qw * qz),
+        1.0 - 2.0 * (qx * qx + qz * qz),
+        2.0 * (qy * qz - qw * qx),
+        2.0 * (qx * qz - qw * qy),
+        2.0 * (qy * qz + qw * qx),
+        1.0 - 2.0 * (qx * qx + qy * qy),
+    )
+    radius = parameters[LEG_RADIUS]
+    # Rear, right, front, left, as the rotors.
+    wrench = with_leg((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), -radius, 0.0, body, rotation, parameters)
+    wrench = with_leg(wrench, 0.0, -radius, body, rotation, parameters)
+    wrench = with_leg(wrench, radius, 0.0, body, rotation, parameters)
+    wrench = with_leg(wrench, 0.0, radius, body, rotation, parameters)
+    per_mass = parameters[INVERSE_MASS]
+    return (
+        wrench[0] * per_mass,
+        wrench[1] * per_mass,
+        wrench[2] * per_mass,
+        wrench[3] * parameters[INVERSE_INERTIA],
+        wrench[4] * parameters[INVERSE_INERTIA + 1],
+        wrench[5] * parameters[INVERSE_INERTIA + 2],
     )

@@ -1,13 +1,18 @@
-"""The plant's parameters: float64 of shape (N_PARAMETERS, n), one column a vehicle. The constants are rows."""
+"""The plant's parameters: float64 of shape (N_PARAMETERS, n), one column a vehicle. The constants are rows.
+
+Kernels take one vehicle's by value, as `Column`: the constants are its indices.
+"""
 
 from __future__ import annotations
 
 from math import inf, pi, sqrt
+from typing import TypeAlias
 
 import numpy as np
 
 from mavsitl.airframes import Airframe
 from mavsitl.scenario import Offnominal
+from mavsitl_vehicle.plant.inlined import inlined
 from mavsitl_vehicle.plant.state import Array
 
 MASS = 0
@@ -51,6 +56,9 @@ INVERSE_MASS = 26
 INVERSE_INERTIA = 27
 """Rows 27:30: 1 / I_xx, 1 / I_yy, 1 / I_zz, 1/(kg m^2)."""
 N_PARAMETERS = 30
+
+Column: TypeAlias = tuple[float, ...]
+"""The N_PARAMETERS rows of one vehicle."""
 
 CONTACT_SINK_M = 1.0e-3
 """How far each leg is pressed in at rest. It sets the bounce's angular frequency, sqrt(g / sink): 99 rad/s."""
@@ -99,3 +107,14 @@ def plant_parameters(airframe: Airframe, offnominal: Offnominal, ground_contact:
     p[INVERSE_MASS] = 1.0 / mass
     p[INVERSE_INERTIA : INVERSE_INERTIA + 3] = 1.0 / p[INERTIA : INERTIA + 3]
     return p
+
+
+@inlined
+def parameters_of(parameters: Array, j: int) -> Column:
+    """Of vehicle `j`."""
+    p = parameters
+    return (
+        p[0, j], p[1, j], p[2, j], p[3, j], p[4, j], p[5, j], p[6, j], p[7, j], p[8, j], p[9, j],
+        p[10, j], p[11, j], p[12, j], p[13, j], p[14, j], p[15, j], p[16, j], p[17, j], p[18, j], p[19, j],
+        p[20, j], p[21, j], p[22, j], p[23, j], p[24, j], p[25, j], p[26, j], p[27, j], p[28, j], p[29, j],
+    )  # fmt: skip

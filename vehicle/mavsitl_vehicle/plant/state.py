@@ -27,6 +27,8 @@ Body: TypeAlias = tuple[float, float, float, float, float, float, float, float, 
 """Rows 0:13 of one vehicle, or their time derivatives: kernels pass it by value, so a stage lives in registers."""
 Rotors: TypeAlias = tuple[float, float, float, float]
 """Rows 13:17 of one vehicle."""
+Wind: TypeAlias = tuple[float, float, float]
+"""At one vehicle, m/s NWU."""
 
 
 def initial_state(

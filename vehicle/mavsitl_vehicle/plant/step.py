@@ -12,20 +12,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavsitl.compiled import compiled
+from mavsitl_vehicle.plant import lanes
 from mavsitl_vehicle.plant.body import body_derivative
 from mavsitl_vehicle.plant.contact import contact_derivative
 from mavsitl_vehicle.plant.inlined import inlined
-from mavsitl_vehicle.plant.parameters import CONTACT_REACH, MAX_ROTOR_SPEED, ROTOR_RATE
+from mavsitl_vehicle.plant.lanes import LANES
+from mavsitl_vehicle.plant.parameters import (
+    CONTACT_REACH,
+    MAX_ROTOR_SPEED,
+    N_PARAMETERS,
+    ROTOR_RATE,
+    Column,
+    parameters_of,
+)
 from mavsitl_vehicle.plant.rotor import decay
-from mavsitl_vehicle.plant.state import OMEGA, ROTOR, VELOCITY, Array, Body, Rotors
+from mavsitl_vehicle.plant.state import N_STATES, ROTOR, VELOCITY, Array, Body, Rotors, Wind
 
 
 @inlined
-def derivative(body: Body, rotors: Rotors, wind_nwu_m_s: Array, parameters: Array, j: int) -> Body:
-    """d/dt of vehicle `j`'s body, on the ground or in the air."""
-    d = body_derivative(body, rotors, wind_nwu_m_s, parameters, j)
-    if body[2] < parameters[CONTACT_REACH, j]:
-        a_x, a_y, a_z, p, q, r = contact_derivative(body, parameters, j)
+def derivative(body: Body, rotors: Rotors, wind: Wind, parameters: Column, on_ground: bool) -> Body:
+    """d/dt of a body; its legs touch the ground only if that is `on_ground` as well."""
+    d = body_derivative(body, rotors, wind, parameters)
+    if on_ground and body[2] < parameters[CONTACT_REACH]:
+        a_x, a_y, a_z, p, q, r = contact_derivative(body, parameters)
         return (
             *d[:3],
             d[3] + a_x,
@@ -97,9 +106,102 @@ def body_of(x: Array, j: int) -> Body:
 
 
 @inlined
-def rotors_of(x: Array, j: int) -> Rotors:
-    """Rows 13:17 of vehicle `j`."""
-    return x[ROTOR, j], x[ROTOR + 1, j], x[ROTOR + 2, j], x[ROTOR + 3, j]
+def four_of(rows: Array, first: int, j: int) -> Rotors:
+    """Four rows from `first` on of vehicle `j`."""
+    return rows[first, j], rows[first + 1, j], rows[first + 2, j], rows[first + 3, j]
+
+
+@inlined
+def wind_of(wind_nwu_m_s: Array, j: int) -> Wind:
+    """At vehicle `j`."""
+    return wind_nwu_m_s[0, j], wind_nwu_m_s[1, j], wind_nwu_m_s[2, j]
+
+
+@inlined
+def put(x: Array, j: int, body: Body, rotors: Rotors) -> None:
+    """Into rows 0:17 of vehicle `j`."""
+    x[0, j], x[1, j], x[2, j] = body[0], body[1], body[2]
+    x[3, j], x[4, j], x[5, j] = body[3], body[4], body[5]
+    x[6, j], x[7, j], x[8, j], x[9, j] = body[6], body[7], body[8], body[9]
+    x[10, j], x[11, j], x[12, j] = body[10], body[11], body[12]
+    x[ROTOR, j], x[ROTOR + 1, j], x[ROTOR + 2, j], x[ROTOR + 3, j] = rotors
+
+
+@inlined
+def stepped(
+    body: Body,
+    rotors: Rotors,
+    command: Rotors,
+    wind: Wind,
+    parameters: Column,
+    dt_s: float,
+    held: bool,
+    on_ground: bool,
+) -> tuple[Body, Rotors, bool]:
+    """Body and rotors after a step, and whether the vehicle came within the ground's reach.
+
+    Where it did, the result is right only if that is `on_ground`; where it did not, it is the same bits either way.
+    """
+    limit = parameters[MAX_ROTOR_SPEED]
+    target = (
+        clipped(command[0], limit),
+        clipped(command[1], limit),
+        clipped(command[2], limit),
+        clipped(command[3], limit),
+    )
+    half_decay, full_decay = decay(parameters[ROTOR_RATE] * dt_s)
+    start = rotors if full_decay > 0.0 else target
+    middle = lagged(target, start, half_decay)
+    end = lagged(target, start, full_decay)
+    still = (*body[:3], 0.0, 0.0, 0.0, *body[6:10], 0.0, 0.0, 0.0)
+
+    d1 = derivative(body, start, wind, parameters, on_ground)
+    second = along(body, 0.5 * dt_s, d1)
+    d2 = derivative(second, middle, wind, parameters, on_ground)
+    third = along(body, 0.5 * dt_s, d2)
+    d3 = derivative(third, middle, wind, parameters, on_ground)
+    fourth = along(body, dt_s, d3)
+    d4 = derivative(fourth, end, wind, parameters, on_ground)
+    reach = parameters[CONTACT_REACH]
+    touches = body[2] < reach or second[2] < reach or third[2] < reach or fourth[2] < reach
+    slope = along(along(d1, 2.0, along(d2, 1.0, d3)), 1.0, d4)
+    body = along(body, dt_s / 6.0, slope)
+
+    w, a, b, c = body[6], body[7], body[8], body[9]
+    scale = 1.0 / sqrt((w * w + a * a) + (b * b + c * c))
+    flown = (*body[:6], w * scale, a * scale, b * scale, c * scale, *body[10:])
+    return still if held else flown, end, touches
+
+
+@inlined
+def stepped_lane(block: Array, dt_s: float, lane: int, on_ground: bool) -> tuple[Body, Rotors, bool]:
+    """`stepped` of one lane of a block."""
+    return stepped(
+        lanes.body_in(block, lane),
+        lanes.four_in(block, ROTOR, lane),
+        lanes.four_in(block, lanes.COMMAND, lane),
+        lanes.wind_in(block, lane),
+        lanes.parameters_in(block, lane),
+        dt_s,
+        block[lanes.HELD * LANES + lane] != 0.0,
+        on_ground,
+    )
+
+
+@inlined
+def step_lanes(block: Array, dt_s: float) -> None:
+    """Steps a block: first as if all were in the air, and, if any was not, again."""
+    touching = 0.0
+    for lane in range(LANES):
+        body, rotors, touches = stepped_lane(block, dt_s, lane, False)
+        lanes.put_after(block, lane, body, rotors)
+        block[lanes.TOUCHES * LANES + lane] = 1.0 if touches else 0.0
+    for lane in range(LANES):
+        touching += block[lanes.TOUCHES * LANES + lane]
+    if touching > 0.0:
+        for lane in range(LANES):
+            body, rotors, _ = stepped_lane(block, dt_s, lane, True)
+            lanes.put_after(block, lane, body, rotors)
 
 
 @compiled
@@ -110,47 +212,37 @@ def rk4_step(
     parameters: Array,
     dt_s: float,
     held: NDArray[np.bool_],
+    block: Array,
 ) -> None:
-    """Advance `x` (17, n) in place by `dt_s`.
+    """Advance `x` (17, n) in place by `dt_s`: LANES vehicles at a time, then the rest one by one.
 
     Commands (4, n) are clipped to what the rotors can do; ideal rotors take them at once. Wind is (3, n). A vehicle
-    that is `held` (n,) keeps its pose, with no velocity and no rates, while its rotors follow.
+    that is `held` (n,) keeps its pose, with no velocity and no rates, while its rotors follow. `block` (BLOCK_SIZE,)
+    is scratch.
     """
-    half_dt = 0.5 * dt_s
-    sixth_dt = dt_s / 6.0
-    for j in range(x.shape[1]):
-        limit = parameters[MAX_ROTOR_SPEED, j]
-        command = (
-            clipped(rotor_speed_command_rad_s[0, j], limit),
-            clipped(rotor_speed_command_rad_s[1, j], limit),
-            clipped(rotor_speed_command_rad_s[2, j], limit),
-            clipped(rotor_speed_command_rad_s[3, j], limit),
+    n = x.shape[1]
+    alone = n - n % LANES
+    for first in range(0, alone, LANES):
+        lanes.gather(block, 0, N_STATES, x, first)
+        lanes.gather(block, lanes.COMMAND, 4, rotor_speed_command_rad_s, first)
+        lanes.gather(block, lanes.WIND, 3, wind_nwu_m_s, first)
+        lanes.gather(block, lanes.PARAMETERS, N_PARAMETERS, parameters, first)
+        for lane in range(LANES):
+            block[lanes.HELD * LANES + lane] = 1.0 if held[first + lane] else 0.0
+        step_lanes(block, dt_s)
+        lanes.scatter(block, lanes.AFTER, N_STATES, x, first)
+    for j in range(alone, n):
+        body, rotors, _ = stepped(
+            body_of(x, j),
+            four_of(x, ROTOR, j),
+            four_of(rotor_speed_command_rad_s, 0, j),
+            wind_of(wind_nwu_m_s, j),
+            parameters_of(parameters, j),
+            dt_s,
+            held[j],
+            True,
         )
-        half_decay, full_decay = decay(parameters[ROTOR_RATE, j] * dt_s)
-        start = rotors_of(x, j) if full_decay > 0.0 else command
-        middle = lagged(command, start, half_decay)
-        end = lagged(command, start, full_decay)
-        x[ROTOR, j], x[ROTOR + 1, j], x[ROTOR + 2, j], x[ROTOR + 3, j] = end
-        if held[j]:
-            for i in range(3):
-                x[VELOCITY + i, j] = 0.0
-                x[OMEGA + i, j] = 0.0
-            continue
-
-        body = body_of(x, j)
-        d1 = derivative(body, start, wind_nwu_m_s, parameters, j)
-        d2 = derivative(along(body, half_dt, d1), middle, wind_nwu_m_s, parameters, j)
-        d3 = derivative(along(body, half_dt, d2), middle, wind_nwu_m_s, parameters, j)
-        d4 = derivative(along(body, dt_s, d3), end, wind_nwu_m_s, parameters, j)
-        slope = along(along(d1, 2.0, along(d2, 1.0, d3)), 1.0, d4)
-        body = along(body, sixth_dt, slope)
-
-        w, a, b, c = body[6], body[7], body[8], body[9]
-        scale = 1.0 / sqrt((w * w + a * a) + (b * b + c * c))
-        x[0, j], x[1, j], x[2, j] = body[0], body[1], body[2]
-        x[3, j], x[4, j], x[5, j] = body[3], body[4], body[5]
-        x[6, j], x[7, j], x[8, j], x[9, j] = w * scale, a * scale, b * scale, c * scale
-        x[10, j], x[11, j], x[12, j] = body[10], body[11], body[12]
+        put(x, j, body, rotors)
 
 
 @compiled
@@ -166,6 +258,8 @@ def linear_acceleration(
     An accelerometer measures this plus gravity (g along z up), turned into the body.
     """
     for j in range(x.shape[1]):
-        d = derivative(body_of(x, j), rotors_of(x, j), wind_nwu_m_s, parameters, j)
+        d = derivative(
+            body_of(x, j), four_of(x, ROTOR, j), wind_of(wind_nwu_m_s, j), parameters_of(parameters, j), True
+        )
         for i in range(3):
             acceleration_nwu_m_s2[i, j] = 0.0 if held[j] else d[VELOCITY + i]

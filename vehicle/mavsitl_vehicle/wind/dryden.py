@@ -54,12 +54,12 @@ def paper_scales(wind: DrydenPaper) -> Scales:
     h = wind.altitude_m
     base = 0.177 + 0.000823 * h
     length_u = h / base**1.2
-    sigma_w = 0.1 * wind.wind_speed_20ft_m_s
+    sigma_w = 0.1 * wind.speed_20ft_m_s
     ratio = 1.0 / base**0.4
     return Scales(
         length_m=(length_u, length_u / 2.0, h / 2.0),
         sigma_m_s=(sigma_w * ratio, sigma_w * ratio * ratio, sigma_w),
-        speed_m_s=wind.wind_speed_20ft_m_s,
+        speed_m_s=wind.speed_20ft_m_s,
     )
 
 
@@ -68,7 +68,7 @@ def mil_scales(wind: DrydenMil) -> Scales:
     h_ft = wind.altitude_m / FOOT_M
     base = 0.177 + 0.000823 * h_ft
     length_u = h_ft / base**1.2 * FOOT_M
-    sigma_w = 0.1 * wind.wind_speed_20ft_m_s
+    sigma_w = 0.1 * wind.speed_20ft_m_s
     sigma_u = sigma_w / base**0.4
     return Scales(
         length_m=(length_u, length_u / 2.0, wind.altitude_m / 2.0),
@@ -80,7 +80,7 @@ def mil_scales(wind: DrydenMil) -> Scales:
 def mil_mean_speed_m_s(wind: DrydenMil) -> float:
     """MIL-F-8785C's mean wind at the altitude: u20 ln(h / z_0) / ln(20 ft / z_0)."""
     h_ft = max(wind.altitude_m / FOOT_M, PROFILE_FLOOR_FT)
-    return wind.wind_speed_20ft_m_s * log(h_ft / ROUGHNESS_FT) / log(REFERENCE_FT / ROUGHNESS_FT)
+    return wind.speed_20ft_m_s * log(h_ft / ROUGHNESS_FT) / log(REFERENCE_FT / ROUGHNESS_FT)
 
 
 def density(omega_rad_s: Array, scales: Scales, component: int) -> Array:

@@ -5,6 +5,8 @@ The rows of a short stretch are joined by `FlightData` as those of a whole fligh
 
 from __future__ import annotations
 
+import sys
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -58,6 +60,8 @@ class Sums:
         """Of the newest sample, from the release."""
         self.lost_s: float | None = None
         """When the position error first passed `LOST_M` or was not finite; nothing is added from then on."""
+        self._rotors: tuple[npt.NDArray[Any], ...] | None = None
+        """Each rotor's first speed, and sums of what it differs from that, and of its squares."""
         self.left_offboard = 0
         """How often another mode began to fly, a fail-safe's."""
         self.weight_range = (1.0, 1.0)
@@ -72,6 +76,15 @@ class Sums:
     def largest(self) -> Six:
         """Largest absolute errors so far, as `rmse`."""
         return _six(self._largest)
+
+    @property
+    def effort_rad_s(self) -> float | None:
+        """RMS of the rotors' speeds about each one's mean so far; None where none was logged."""
+        if self._rotors is None:
+            return None
+        _, total, squares = self._rotors
+        variance = squares / self.samples - np.square(total / self.samples)
+        return sqrt(max(float(np.mean(variance)), 0.0))
 
     def collect(self) -> None:
         """Add what was recorded since the last time, and drop it."""
@@ -110,13 +123,24 @@ class Sums:
         self.time_s = float(stretch.time_s[count - 1])
         self._squares += np.sum(np.square(errors), axis=0)
         self._largest = np.maximum(self._largest, np.max(np.abs(errors), axis=0))
+        if stretch.rotor_speed_rad_s is not None:
+            self._add_rotors(stretch.rotor_speed_rad_s[:count])
         if stretch.weights is not None:
             known = self._first_weights > 0.0
             ratios = (stretch.weights[:count] / np.where(known, self._first_weights, 1.0))[:, known]
             if np.isnan(ratios).all():  # none has come over a bad link yet
                 return
             low, high = self.weight_range
-            self.weight_range = (min(low, float(np.nanmin(ratios))), max(high, float(np.nanmax(ratios))))
+            largest = min(float(np.nanmax(ratios)), sys.float_info.max)  # a law that diverges passes it
+            self.weight_range = (min(low, float(np.nanmin(ratios))), max(high, largest))
+
+    def _add_rotors(self, speeds: npt.NDArray[np.float64]) -> None:
+        """(k, 4), from the stretch's first sample on."""
+        if self._rotors is None:
+            self._rotors = (speeds[0], np.zeros(speeds.shape[1]), np.zeros(speeds.shape[1]))
+        first, total, squares = self._rotors
+        change = speeds - first
+        self._rotors = (first, total + change.sum(axis=0), squares + np.square(change).sum(axis=0))
 
     def _hold(self, ground: dict[str, Table], name: str, stamps: npt.NDArray[np.uint64]) -> None:
         """At each stamp the ground's newest row that is not younger, so that what a link loses is not left out."""

@@ -1,0 +1,1 @@
+"""`mavsitl tune`: a controller's gains, searched on some seeds and judged on others."""
