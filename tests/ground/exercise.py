@@ -59,11 +59,17 @@ def telemetry(rng: np.random.Generator) -> Iterator[tuple[int, Any]]:
         yield k * PERIOD_US, (x, y, z, (q_w, q_x, q_y, q_z), *rest)
 
 
+def take(values: Any, in_body: bool, into: Observer) -> bool:
+    arguments: list[Any] = [*values, in_body, True, into.state]
+    good: bool = observer.take_odometry(*arguments)
+    return good
+
+
 def states(rng: np.random.Generator) -> Iterator[Observer]:
     """The same as states, with a true wind from the second on."""
     seen = Observer()
     for stamp_us, values in telemetry(rng):
-        assert observer.take_odometry(*values, in_body=False, newer=True, state=seen.state)
+        assert take(values, False, seen)
         seen.stamp_us = stamp_us
         yield seen
         seen.state["true_wind"][0, :, 0] = rng.normal(size=3)
@@ -96,7 +102,7 @@ def digests() -> dict[str, str]:
     for _, values in telemetry(rng):
         x, y, z, q, vx, vy, vz, *rates = values
         for in_body in (False, True):
-            good = observer.take_odometry(*values, in_body=in_body, newer=True, state=seen.state)
+            good = take(values, in_body, seen)
             add("odometry", good, *(seen.state[name] for name in ("position", "velocity", "quaternion", "angle_rates")))
         w_x, w_y, w_z = rates
         good = observer.take_attitude(q, w_x, w_y, w_z, True, seen.state)
