@@ -85,6 +85,10 @@ def compiled(function: F) -> F:
 
 
 def inlined(function: F) -> F:
+    """As `compiled`, for a small function that compiled ones call: it becomes part of their text.
+
+    Compiling it apart and again with each caller would take longer; large ones, the other way round, as texts.
+    """
     if not JIT:
         return function
     import numba

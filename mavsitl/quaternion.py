@@ -8,7 +8,7 @@ roll, each about the axis the last turn left). Functions that call their argumen
 
 from __future__ import annotations
 
-from math import atan2, copysign, cos, hypot, isfinite, pi, sin, sqrt
+from math import atan2, cos, hypot, isfinite, pi, sin, sqrt
 
 from mavsitl.frames import Quaternion, Vector
 
@@ -98,7 +98,7 @@ def to_euler(unit: Quaternion) -> Vector:
     if cos_pitch < _GIMBAL_LOCK_COS_PITCH:
         yaw = 2.0 * atan2(x, w)
         if abs(yaw) > pi:
-            yaw -= copysign(2.0 * pi, yaw)
+            yaw -= 2.0 * pi if yaw > 0.0 else -2.0 * pi
         return 0.0, pitch, -yaw if sin_pitch > 0.0 else yaw
     return atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)), pitch, atan2(forward_y, forward_x)
 

@@ -74,7 +74,7 @@ class Controller:
         else:
             self._cycle = cycle.net_cycle if self.learns else cycle.pid_cycle
         # Compiles, or reads the cache, before the clock runs.
-        self.update(0.0, Observer(), np.zeros(cycle.COLUMNS), 0, 0, 0, 0)
+        self.update(0.0, Observer(settings.telemetry), np.zeros(cycle.COLUMNS), 0, 0, 0, 0)
         self.reset()
 
     def reset(self) -> None:

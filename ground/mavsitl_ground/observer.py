@@ -17,6 +17,7 @@ from mavsitl.control.arrays import Floats, Record, record
 from mavsitl.control.rotation import euler_rates, normalise, rotate, to_euler
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Quaternion
+from mavsitl.quaternion import IDENTITY
 
 SPLIT = (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
 ODOMETRY = (mavlink.MAVLINK_MSG_ID_ODOMETRY,)
@@ -136,6 +137,13 @@ class Observer:
         self.handlers = {key: handler for key, handler in handlers.items() if key not in ignored}
         """What takes a frame of a message in, by the message's id. One with a non-finite value is not taken."""
         self.reset()
+        # Compiles, or reads the cache, before the clock runs; what is not newer changes nothing.
+        still = (0.0, 0.0, 0.0)
+        if source != "split":
+            take_odometry(*still, IDENTITY, *still, *still, False, False, self.state)
+        if source != "odometry":
+            take_attitude(IDENTITY, *still, False, self.state)
+            take_linear(*still, *still, False, self.state)
 
     def reset(self) -> None:
         """Forget everything: another vehicle, or the same after a restart."""

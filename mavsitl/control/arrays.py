@@ -17,6 +17,10 @@ Record: TypeAlias = npt.NDArray[np.void]
 """One record, (1,): named numbers, arrays and records in one piece of memory."""
 
 
+_layouts: dict[np.dtype[np.void], np.dtype[np.void]] = {}
+"""Each layout once: numba knows a layout that is the same object in no time, and compares an equal one by field."""
+
+
 def record(**fields: Any) -> Record:
     """A record of copies of these numbers, arrays and records, under their names.
 
@@ -25,7 +29,8 @@ def record(**fields: Any) -> Record:
     """
     parts = {name: np.asarray(value) for name, value in fields.items()}
     parts = {name: part.reshape(()) if part.dtype.names else part for name, part in parts.items()}
-    made = np.zeros(1, np.dtype([(name, part.dtype, part.shape) for name, part in parts.items()], align=True))
+    layout = np.dtype([(name, part.dtype, part.shape) for name, part in parts.items()], align=True)
+    made = np.zeros(1, _layouts.setdefault(layout, layout))
     for name, part in parts.items():
         made[name][0] = part
     return made

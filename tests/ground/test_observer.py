@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from mavsitl_ground.observer import Observer
 
+from mavsitl.codec import Frame
 from mavsitl.dialect import mavlink
 from mavsitl.frames import flip_quaternion, flip_vector
 from mavsitl.quaternion import conjugate, from_euler, rotate
+from tests.ground.exercise import framed
 
 ANGLES = (radians(20.0), radians(-10.0), radians(120.0))
 QUATERNION = from_euler(*ANGLES)
@@ -20,7 +22,7 @@ VELOCITY = (0.5, 0.25, -0.75)
 OMEGA = (0.1, -0.2, 0.3)
 
 
-def odometry(stamp_us: int, *, child: int = mavlink.MAV_FRAME_LOCAL_NED, **other: Any) -> Any:
+def odometry(stamp_us: int, *, child: int = mavlink.MAV_FRAME_LOCAL_NED, **other: Any) -> Frame:
     """The state above as PX4 sends it, or with fields of its own."""
     attitude_ned = flip_quaternion(*QUATERNION)
     velocity = flip_vector(*VELOCITY)
@@ -33,21 +35,22 @@ def odometry(stamp_us: int, *, child: int = mavlink.MAV_FRAME_LOCAL_NED, **other
         **dict(zip(("rollspeed", "pitchspeed", "yawspeed"), flip_vector(*OMEGA), strict=True)),
         "frame_id": mavlink.MAV_FRAME_LOCAL_NED,
     } | other
-    return mavlink.MAVLink_odometry_message(
-        time_usec=stamp_us, child_frame_id=child, pose_covariance=[nan] * 21, velocity_covariance=[nan] * 21, **fields
+    unknown = [nan] * 21
+    return framed(
+        mavlink.MAVLink_odometry_message(
+            time_usec=stamp_us, child_frame_id=child, pose_covariance=unknown, velocity_covariance=unknown, **fields
+        )
     )
 
 
-def attitude(stamp_us: int) -> Any:
-    return mavlink.MAVLink_attitude_quaternion_message(
-        stamp_us // 1000, *flip_quaternion(*QUATERNION), *flip_vector(*OMEGA)
-    )
+def attitude(stamp_us: int) -> Frame:
+    values = (*flip_quaternion(*QUATERNION), *flip_vector(*OMEGA))
+    return framed(mavlink.MAVLink_attitude_quaternion_message(stamp_us // 1000, *values))
 
 
-def position(stamp_us: int) -> Any:
-    return mavlink.MAVLink_local_position_ned_message(
-        stamp_us // 1000, *flip_vector(*POSITION), *flip_vector(*VELOCITY)
-    )
+def position(stamp_us: int) -> Frame:
+    values = (*flip_vector(*POSITION), *flip_vector(*VELOCITY))
+    return framed(mavlink.MAVLink_local_position_ned_message(stamp_us // 1000, *values))
 
 
 def state(observer: Observer) -> list[float]:
@@ -61,6 +64,8 @@ def state(observer: Observer) -> list[float]:
     return [float(value) for part in parts for value in part[:, 0]]
 
 
+WIRE = 2e-7
+"""Rounding of a float32, of angles from such a quaternion, and of a turned velocity."""
 EXPECTED = [*POSITION, *VELOCITY, *QUATERNION, *ANGLES, *OMEGA]
 
 
@@ -68,7 +73,7 @@ EXPECTED = [*POSITION, *VELOCITY, *QUATERNION, *ANGLES, *OMEGA]
 def test_odometry_in_either_child_frame(child: int) -> None:
     observer = Observer()
     observer.receive(odometry(8000, child=child))
-    assert state(observer) == pytest.approx(EXPECTED, abs=1e-12)
+    assert state(observer) == pytest.approx(EXPECTED, abs=WIRE)
     assert observer.stamp_us == 8000
     assert observer.fresh
 
@@ -82,7 +87,7 @@ def test_split_telemetry_is_the_same_state(attitude_first: bool) -> None:
     observer.receive(second(8000))
     assert observer.fresh
     assert observer.stamp_us == 8000
-    assert state(observer) == pytest.approx(EXPECTED, abs=1e-12)
+    assert state(observer) == pytest.approx(EXPECTED, abs=WIRE)
 
 
 def test_odometry_in_other_frames_is_ignored() -> None:
@@ -128,9 +133,9 @@ def test_split_messages_that_are_not_finite_are_ignored(field: int) -> None:
     before = state(observer)
     values: list[Any] = [8, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     values[field] = nan
-    observer.receive(mavlink.MAVLink_attitude_quaternion_message(*values))
+    observer.receive(framed(mavlink.MAVLink_attitude_quaternion_message(*values)))
     if field < 7:
-        observer.receive(mavlink.MAVLink_local_position_ned_message(*values[:7]))
+        observer.receive(framed(mavlink.MAVLink_local_position_ned_message(*values[:7])))
     assert state(observer) == before
     assert observer.stamp_us == 4000
 
@@ -229,14 +234,24 @@ def test_age_and_validity_are_by_the_ground_s_clock() -> None:
 
 
 def test_true_wind_is_turned_and_forgotten() -> None:
+    def vector(name: bytes, *values: float) -> Frame:
+        return framed(mavlink.MAVLink_debug_vect_message(name, 0, *values))
+
     observer = Observer()
-    observer.receive(mavlink.MAVLink_debug_vect_message(b"OTHER", 0, 9.0, 9.0, 9.0))
-    assert observer.true_wind_nwu_m_s is None
-    message = mavlink.MAVLink_debug_vect_message(b"WIND_TRUE", 0, 1.0, 2.0, 3.0)
-    message.name = "WIND_TRUE"  # as a decoded message has it
-    observer.receive(message)
-    wind = observer.true_wind_nwu_m_s
-    assert wind is not None
-    np.testing.assert_array_equal(wind, [[1.0], [-2.0], [-3.0]])
+    observer.receive(vector(b"OTHER", 9.0, 9.0, 9.0))
+    assert np.isnan(observer.true_wind_nwu_m_s).all()
+    observer.receive(vector(b"WIND_TRUE", 1.0, 2.0, 3.0))
+    observer.receive(vector(b"WIND_TRUE", 4.0, nan, inf))
+    np.testing.assert_array_equal(observer.true_wind_nwu_m_s, [[1.0], [-2.0], [-3.0]])
     observer.reset()
-    assert observer.true_wind_nwu_m_s is None
+    assert np.isnan(observer.true_wind_nwu_m_s).all()
+
+
+def test_messages_that_are_no_state_are_left_alone() -> None:
+    observer = Observer("odometry")
+    before = state(observer)
+    observer.receive(framed(mavlink.MAVLink_heartbeat_message(2, 12, 209, 0x60000, 4, 3)))
+    observer.receive(attitude(4000))
+    observer.receive(position(4000))
+    assert state(observer) == before
+    assert observer.stamp_us == -1

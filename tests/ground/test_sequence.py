@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from mavsitl_ground.sequence import FORCE_DISARM, Handshake, Phase
+from mavsitl_ground.sequence import FORCE_DISARM, NOW, SILENCE_TIMEOUT_US, Handshake, Phase
 
 from mavsitl.codec import packer, parse
 from mavsitl.dialect import mavlink
 from mavsitl.node import Node
 from tests.drivers.exercise import Air, shortened
+from tests.ground.exercise import framed
 
 FLIGHT = shortened("hover-calm", 1.0)
 LONG = shortened("hover-calm", 60.0)
@@ -211,7 +212,7 @@ def test_the_oracle_does_not_fly_blind() -> None:
         handshake.step(now_us)
         if sent:
             sent.clear()
-            handshake.on_message(refusal, now_us)
+            handshake.on_message(framed(refusal), now_us)
     assert handshake.phase is Phase.ABORTED
     assert said[-1] == f"no flight without message {WIND_ID}: the scenario needs it"
 
@@ -221,9 +222,9 @@ def test_a_vehicle_whose_heartbeats_are_lost_is_there_as_long_as_anything_comes(
     handshake = Handshake(lambda command, confirmation, params: None, [], land=True, report=said.append)
     heartbeat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
     handshake.on_heartbeat(heartbeat, 1, 1, 0)
-    state = mavlink.MAVLink_attitude_message(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    attitude = framed(mavlink.MAVLink_attitude_message(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     for now_us in range(0, 10_000_001, 100_000):
-        handshake.on_message(state, now_us)
+        handshake.on_message(attitude, now_us)
         handshake.step(now_us)
     assert handshake.target == (1, 1)
     handshake.step(13_000_000)
@@ -231,6 +232,21 @@ def test_a_vehicle_whose_heartbeats_are_lost_is_there_as_long_as_anything_comes(
     handshake.step(13_000_001)
     assert handshake.target is None
     assert said[-1] == "vehicle lost: silent for 3 s"
+
+
+def test_in_flight_the_handshake_waits_for_messages_and_for_silence() -> None:
+    air = in_flight()
+    handshake = air.ground._handshake
+    heard_us = air.ground_us - air.ground.period_us  # what comes is heard at the time of the step before
+    assert handshake.due_us == heard_us + SILENCE_TIMEOUT_US
+    handshake.step(handshake.due_us)
+    assert air.ground.phase == "FLY"
+    handshake.armed = False  # by the next HEARTBEAT: from here on each period counts
+    assert handshake.due_us == NOW
+    handshake.armed = True
+    handshake.step(heard_us + SILENCE_TIMEOUT_US + 1)
+    assert air.ground.phase == "SEARCH"
+    assert handshake.due_us == NOW
 
 
 def test_a_vehicle_that_boots_is_another_flight() -> None:
