@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -54,6 +55,15 @@ def _content(file: Path) -> bytes:
         assert time.monotonic() < end_s, f"{file} was not written"
         time.sleep(0.02)
     return file.read_bytes()
+
+
+@pytest.fixture(autouse=True)
+def _handlers() -> Iterator[None]:
+    """`mavsitl sweep` sets signal handlers of its own."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from mavsitl import __version__, cli, pair, scenario
 from mavsitl.cli import main
 from mavsitl.link.udp import LOOPBACK
 
-COMMANDS = ("fly", "vehicle", "ground", "check", "link", "inject", "param", "report", "scenarios", "chaos")
+COMMANDS = ("fly", "vehicle", "ground", "check", "link", "inject", "param", "sweep", "report", "scenarios", "chaos")
 
 HELP = {
     "fly": ("--seed", "--airframe", "--law", "--level", "--wind-information", "--duration", "--set", "--run-dir",
@@ -38,6 +38,8 @@ HELP = {
                "SYS_FAILURE_EN", "Exit codes", "mavsitl inject motor off 2"),
     "param": ("{get,set,list}", "NAME[=VALUE]", "--endpoint", "--instance", "--system", "--timeout", "--json",
               "Exit codes", "mavsitl param set COM_OF_LOSS_T=0.5"),
+    "sweep": ("--set", "--compare", "--seeds", "--jobs", "--scheduler", "--output", "--no-report", "--json",
+              "KEY=START:STOP:STEP", "--set wind.speed_20ft_m_s=0,5,10", "130 interrupted"),
     "report": ("RUN", "run.json", "report.html"),
     "scenarios": ("--json",),
     "chaos": ("--json", "NAME[:ARGUMENT...][@PORT]", "ack-late:2.5:NAV_TAKEOFF@gcs"),
