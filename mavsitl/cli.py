@@ -1319,6 +1319,10 @@ def _sweep(options: argparse.Namespace) -> int:
             console.print(text, soft_wrap=True, markup=False)
         missing = len(plan.cases) - known.flown
         if missing:
+            if options.scheduler:
+                import logging
+
+                logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its errors come as ours
             crew = workers.Dask(options.scheduler) if options.scheduler else workers.local(
                 min(options.jobs or workers.cores(), missing)
             )  # fmt: skip

@@ -34,6 +34,10 @@ class Cluster:
             arguments = [self.address, "--nthreads", "1", "--no-nanny", "--local-directory", str(self._folder)]
             self.workers.append(self._start("worker", arguments))
 
+    def kill_scheduler(self) -> None:
+        self._processes[0].kill()
+        self._processes[0].wait()
+
     def close(self) -> None:
         for process in reversed(self._processes):
             process.kill()
