@@ -65,7 +65,7 @@ def fly_all(cases: Sequence[Case], workers: Workers) -> Iterator[Row]:
     def lost(data: bytes, text: str) -> bytes:
         return fly.encode(fly.not_flown(fly.decode(data, Case), text))
 
-    for _, data in workers.map(fly.fly_encoded, [fly.encode(each) for each in once], lost):
+    for _, data in workers.map(fly.fly_encoded, map(fly.encode, once), lost):
         yield fly.decode(data, Row)
 
 

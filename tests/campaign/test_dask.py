@@ -49,6 +49,19 @@ def test_many_small_tasks_are_numbered(dask: Cluster) -> None:
         assert list(crew.map(flights.square, [7])) == [(0, 49)]
 
 
+def test_a_sweep_on_a_cluster_leaves_what_one_here_leaves(dask: Cluster, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    dask.have(2)
+    command = ["sweep", "hover-calm", "--set", "duration_s=1", "--seeds", "3", "--no-report"]
+    for name, crew in (("here", ["--jobs", "1"]), ("there", ["--scheduler", dask.address])):
+        assert cli.main([*command, *crew, "--output", str(tmp_path / name)]) == cli.EXIT_OK
+    here, there = (
+        parquet.read_table(tmp_path / name / "results.parquet").drop_columns("cpu_s") for name in ("here", "there")
+    )
+    assert here.num_rows == 3
+    assert here.equals(there)
+
+
 def test_what_a_task_raises_is_raised_here(dask: Cluster) -> None:
     dask.have(1)
     with Dask(dask.address) as crew, pytest.raises(ArithmeticError, match="not 3"):
@@ -92,6 +105,20 @@ def test_a_task_that_kills_its_workers_is_given_up(dask: Cluster) -> None:
             process.wait(timeout=60.0)
         dask.have(1)
         assert list(crew.map(flights.square, [4])) == [(0, 16)]
+
+
+def test_a_scheduler_that_goes_is_named(tmp_path: Path) -> None:
+    made = Cluster(tmp_path)
+    try:
+        made.have(1)
+        with Dask(made.address) as crew:
+            rows = fly_all([short("hover-calm", seed) for seed in range(1, 100)], crew)
+            next(rows)
+            made.kill_scheduler()
+            with pytest.raises(WorkerError, match=rf"the Dask scheduler at {made.address} went away"):
+                list(rows)
+    finally:
+        made.close()
 
 
 def test_no_scheduler_is_named(

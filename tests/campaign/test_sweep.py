@@ -103,7 +103,7 @@ def test_a_sweep_leaves_rows_and_a_page(tmp_path: Path, capsys: pytest.CaptureFi
     assert facts["mavsitl.code"] == grid.source_digest()
     assert msgspec.json.decode(facts["mavsitl.settings"])["controller.law"] == ["pid", "pidnn"]
     html = (tmp_path / REPORT_FILE).read_text("utf-8")
-    assert html.count("<figure") == html.count("<svg") == 4
+    assert html.count("<figure") == html.count("<svg") == 6
     assert "law pidnn against pid" in html
     assert not list(tmp_path.glob(".*"))
 
@@ -303,10 +303,13 @@ def test_a_page_of_every_kind_of_sweep_is_drawn() -> None:
     alone = [row(1, 0.1)]
     unpaired = [row(1, 0.1, law="pid"), row(1, None, "lost", law="<b>")]
     curves = [row(seed, 0.1 * gain * seed, gain=gain, law=law) for gain in (1, 2, 3) for law in "ab" for seed in (1, 2)]
-    many = [row(seed, 0.1, gain=gain) for gain in range(100) for seed in (1, 2)]
+    many = [row(seed, 0.1, gain=gain) for gain in range(61) for seed in (1, 2)]
     figures = []
-    for rows, keys in ((alone, []), (unpaired, ["law"]), (curves, ["gain", "law"]), (many, ["gain"])):
-        html = page.render(rows, summarize(rows, keys, keys[-1:]), keys, facts)
+    for rows, keys, compared in (
+        (alone, [], []), (unpaired, ["law"], ["law"]), (curves, ["gain", "law"], ["law"]), (many, ["gain"], []),
+        (curves, ["gain", "law"], ["gain", "law"]),
+    ):  # fmt: skip
+        html = page.render(rows, summarize(rows, keys, compared), keys, facts)
         figures.append(html.count("<figure"))
         assert "<b>" not in html
-    assert figures == [2, 2, 6, 2]
+    assert figures == [2, 2, 6, 2, 10]
