@@ -69,13 +69,14 @@ class Flights:
         grid: list[list[list[Case]]] = []
         for values in candidates:
             grid.append([])
+            labels = {dial.key: value for dial, value in zip(self.space.dials, values, strict=True)}
             for name, factor in zip(self.names, factors, strict=True):
                 flight = self.flight(name, values)
                 whole = scale(flight.scenario)
                 scales.append(tuple(a * b for a, b in zip(whole, factor, strict=True)))
                 flight = self._shortened(flight)
                 durations_s.append(flight.scenario.duration_s)
-                grid[-1].append([case(flight, seed) for seed in self.seeds])
+                grid[-1].append([case(flight, seed, labels) for seed in self.seeds])
         rows = {row.key: row for row in fly_all([each for of in grid for group in of for each in group])}
         n = len(self.names)
         return [score([[rows[each.key] for each in group] for group in of], scales[:n], durations_s[:n]) for of in grid]
