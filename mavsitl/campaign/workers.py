@@ -65,7 +65,7 @@ def fly_all(cases: Sequence[Case], workers: Workers) -> Iterator[Row]:
     def lost(data: bytes, text: str) -> bytes:
         return fly.encode(fly.not_flown(fly.decode(data, Case), text))
 
-    for _, data in workers.map(fly.fly_encoded, [fly.encode(each) for each in once], lost):
+    for _, data in workers.map(fly.fly_encoded, map(fly.encode, once), lost):
         yield fly.decode(data, Row)
 
 
@@ -309,15 +309,20 @@ class Dask:
                 with suppress(OSError, TimeoutError):  # of a scheduler that is gone
                     self._client.cancel(list(under_way), force=True)
 
-    def _check_workers(self) -> None:
-        """Of those that are there; one that comes later is checked when it gets its first task."""
+    def wait_for(self, count: int) -> None:
+        """So many workers. Raises `WorkerError` where they do not come."""
         try:
-            self._client.wait_for_workers(1, timeout=CONNECT_S)
+            self._client.wait_for_workers(count, timeout=CONNECT_S)
         except TimeoutError as error:
+            missing = "has no worker" if count == 1 else f"has fewer than {count} workers"
             raise WorkerError(
-                f"the Dask scheduler at {self._address} has no worker; one is started by: "
+                f"the Dask scheduler at {self._address} {missing}; one is started by: "
                 f"dask worker {self._address} --nthreads 1"
             ) from error
+
+    def _check_workers(self) -> None:
+        """Of those that are there; one that comes later is checked when it gets its first task."""
+        self.wait_for(1)
         try:
             found: dict[str, About] = self._client.run(about)
         except Exception as error:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite, nan
+from math import ceil, isfinite, nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mavsitl import seeds
 from mavsitl.campaign.fly import Row
+from mavsitl.campaign.grid import Labels
 from mavsitl.campaign.summary import MEASURES, CellSummary, Comparison, Interval, Summary, group, pair
 from mavsitl.report.figures import BROKEN, CALM, REFERENCE, UNDERNEATH, WIND, Drawing, svg
 from mavsitl.report.sweep_tables import COMPARED, described, short, shown, versus
@@ -17,14 +18,16 @@ from mavsitl.report.sweep_tables import COMPARED, described, short, shown, versu
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ROW_IN = 0.3
+ROW_IN, LINE_IN = 0.3, 0.24
+"""Of a row of a figure, and of a line of a legend."""
 MOST_ROWS = 60
 """Cells and comparisons drawn; a page is not a book."""
-MOST_LINES = 6
-"""Curves in one figure."""
+MOST_LINES, MOST_FIGURES = 6, 6
+"""Curves in one figure, and figures of one kind."""
 COLOURS = (CALM, WIND, "#1b7837", "#762a83", "#8c510a", "#5c5c66")
 LOG_FROM = 20.0
-"""A span of errors of more than this factor is drawn in logarithms."""
+LOG_RATIO = 4.0
+"""A span of errors, and of ratios, of more than this factor is drawn in logarithms."""
 
 
 def distribution(rows: Sequence[Row], summary: Summary, keys: Sequence[str], name: str) -> Drawing | None:
@@ -37,7 +40,7 @@ def distribution(rows: Sequence[Row], summary: Summary, keys: Sequence[str], nam
 
     def draw(figure: Figure) -> None:
         values = [[value for row in mine if isfinite(value := measure.of(row))] for mine in cells]
-        axes = _rows(figure, [_label(cell) for cell in summary.cells], ", ".join(short(keys)))
+        axes = _rows(figure, [_label(cell.labels) for cell in summary.cells], ", ".join(short(keys)))
         for place, (found, cell, colour) in enumerate(zip(values, summary.cells, colours, strict=True)):
             spread = cell.measures[name]
             if spread.q25 is not None and spread.q75 is not None:
@@ -47,8 +50,8 @@ def distribution(rows: Sequence[Row], summary: Summary, keys: Sequence[str], nam
                       markeredgewidth=0.0, zorder=2)  # fmt: skip
             _mark(axes, spread.median, place, colour)
             if gone := cell.lost + cell.failed:
-                axes.annotate(f"{gone} not flown", (1.0, place), xycoords=("axes fraction", "data"), color=BROKEN,
-                              ha="right", va="center", fontsize=8.0)  # fmt: skip
+                axes.annotate(f"{gone} not flown to the end", (1.0, place), xycoords=("axes fraction", "data"),
+                              color=BROKEN, ha="right", va="center", fontsize=8.0)  # fmt: skip
         _scale(axes, [value for each in values for value in each], "x")
         axes.set_xlabel(measure.title)
 
@@ -67,9 +70,12 @@ def against(summary: Summary, key: str, name: str) -> Drawing | None:
     if not numeric or len(places) < 3 or len(curves) > MOST_LINES:
         return None
     measure = MEASURES[name]
+    lines = ceil(len(curves) / 2) if len(curves) > 1 else 0
+    height_in = 3.2 + LINE_IN * lines
 
     def draw(figure: Figure) -> None:
-        axes = figure.add_axes((0.1, 0.16, 0.87, 0.7 if len(curves) > 1 else 0.79))
+        bottom, top = 0.52 / height_in, 1.0 - (0.15 + LINE_IN * lines) / height_in
+        axes = figure.add_axes((0.1, bottom, 0.87, top - bottom))
         seen: list[float] = []
         for (label, cells), colour in zip(curves.items(), COLOURS, strict=False):
             ordered = sorted(cells, key=lambda cell: float(cell.labels[key]))
@@ -85,39 +91,48 @@ def against(summary: Summary, key: str, name: str) -> Drawing | None:
         _scale(axes, seen, "y")
         axes.set_xlabel(key)
         axes.set_ylabel(measure.title)
-        if len(curves) > 1:
-            figure.legend(*axes.get_legend_handles_labels(), loc="upper right", ncols=min(len(curves), 3))
+        if lines:
+            figure.legend(*axes.get_legend_handles_labels(), loc="upper right", ncols=2, fontsize=8.5)
 
     caption = f"{measure.headline} against {key}: medians and their 95 % intervals"
-    return Drawing(svg(draw, 3.4, f"against-{name}"), caption, "")
+    return Drawing(svg(draw, height_in, f"against-{name}"), caption, "")
 
 
-def differences(rows: Sequence[Row], summary: Summary, name: str) -> Drawing | None:
-    """Each pair a dot: by how much the second setting changes the error of the same seed. None where there is none."""
+def ratios(rows: Sequence[Row], summary: Summary, name: str) -> list[Drawing]:
+    """For each two settings: each pair a dot, the error of the second over that of the first, each other cell a row."""
     measure = MEASURES[name]
     cells = {_key(labels): mine for labels, mine in group(rows, list(summary.cells[0].labels))}
-    shown_ones = [each for each in summary.comparisons if each.measures[name].ratio.value is not None]
-    if not shown_ones or len(shown_ones) > MOST_ROWS:
-        return None
+    settings: dict[str, list[Comparison]] = {}
+    for each in summary.comparisons:
+        if each.measures[name].ratio.value is not None:
+            settings.setdefault(versus(each), []).append(each)
+    made = []
+    for number, (setting, shown_ones) in enumerate(settings.items()):
+        if len(shown_ones) > MOST_ROWS:
+            continue
 
-    def draw(figure: Figure) -> None:
-        labels = [", ".join(filter(None, (versus(each), described(each.labels)))) for each in shown_ones]
-        axes = _rows(figure, labels, "")
-        axes.axvline(0.0, color=REFERENCE, linewidth=0.9)
-        for place, each in enumerate(shown_ones):
-            pairs = pair(cells[_key(_side(each, each.first))], cells[_key(_side(each, each.second))])
-            percent = [100.0 * (measure.of(b) / measure.of(a) - 1.0) for a, b in pairs if measure.of(a) > 0.0]
-            axes.plot(percent, place + _jitter(len(percent)), "o", color=UNDERNEATH, markersize=3.0,
-                      markeredgewidth=0.0, zorder=2)  # fmt: skip
-            ratio = each.measures[name].ratio
-            scaled = [
-                None if bound is None else 100.0 * (bound - 1.0) for bound in (ratio.value, ratio.low, ratio.high)
-            ]
-            _mark(axes, Interval(*scaled), place, CALM if (scaled[0] or 0.0) <= 0.0 else WIND)
-        axes.set_xlabel(f"change of the {measure.name} / %")
+        def draw(figure: Figure, shown_ones: list[Comparison] = shown_ones) -> None:
+            keys = list(shown_ones[0].labels)
+            axes = _rows(figure, [_label(each.labels) for each in shown_ones], ", ".join(short(keys)))
+            axes.axvline(1.0, color=REFERENCE, linewidth=0.9)
+            seen = [1.0]
+            for place, each in enumerate(shown_ones):
+                pairs = pair(cells[_key(_side(each, each.first))], cells[_key(_side(each, each.second))])
+                found = [measure.of(b) / measure.of(a) for a, b in pairs if measure.of(a) > 0.0]
+                axes.plot(found, place + _jitter(len(found)), "o", color=UNDERNEATH, markersize=3.0,
+                          markeredgewidth=0.0, zorder=2)  # fmt: skip
+                ratio = each.measures[name].ratio
+                _mark(axes, ratio, place, CALM if (ratio.value or 0.0) <= 1.0 else WIND)
+                seen += found
+            if min(seen) > 0.0 and max(seen) > LOG_RATIO * min(seen):
+                axes.set_xscale("log")
+                axes.grid(which="minor", axis="x", visible=False)
+            axes.set_xlabel(f"{measure.name}, ratio")
 
-    caption = f"{measure.headline}, seed by seed: below 0 the first-named is better; medians, 95 % intervals"
-    return Drawing(svg(draw, _height(len(shown_ones)), f"differences-{name}"), caption, "")
+        caption = f"{measure.headline}, {setting}, seed by seed: left of 1 it is smaller; medians, 95 % intervals"
+        svg_name = f"ratios-{name}-{number}"
+        made.append(Drawing(svg(draw, _height(len(shown_ones)), svg_name), caption, ""))
+    return made[:MOST_FIGURES]
 
 
 def drawings(rows: Sequence[Row], summary: Summary, keys: Sequence[str]) -> list[Drawing]:
@@ -126,26 +141,20 @@ def drawings(rows: Sequence[Row], summary: Summary, keys: Sequence[str]) -> list
     for name in COMPARED:
         found.append(distribution(rows, summary, keys, name))
         found += [against(summary, key, name) for key in keys]
-        found.append(differences(rows, summary, name))
+        found += ratios(rows, summary, name)
     return [drawing for drawing in found if drawing is not None]
 
 
-def _percent(ratio: Interval) -> Interval:
-    """What a ratio changes."""
-    bounds = (ratio.value, ratio.low, ratio.high)
-    return Interval(*(None if bound is None else 100.0 * (bound - 1.0) for bound in bounds))
-
-
-def _side(each: Comparison, value: Any) -> dict[str, Any]:
+def _side(each: Comparison, value: Any) -> Labels:
     return {**each.labels, each.key: value}
 
 
-def _key(labels: dict[str, Any]) -> frozenset[tuple[str, str]]:
+def _key(labels: Labels) -> frozenset[tuple[str, str]]:
     return frozenset((key, shown(value)) for key, value in labels.items())
 
 
-def _label(cell: CellSummary) -> str:
-    return ", ".join(shown(value) for value in cell.labels.values()) or "all"
+def _label(labels: Labels) -> str:
+    return ", ".join(shown(value) for value in labels.values()) or "all"
 
 
 def _colours(cells: Sequence[CellSummary]) -> list[str]:

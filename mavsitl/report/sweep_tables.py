@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -31,15 +31,18 @@ COMPARED = ("position_m", "attitude_deg")
 
 def comparison_rows(summary: Summary) -> list[list[str]]:
     """Each comparison by each measure."""
-    return [
-        [
-            "\n".join(filter(None, (versus(each), described(each.labels)))) if name == COMPARED[0] else "",
-            MEASURES[name].title, str(each.pairs), _stacked(each.measures[name].difference, signed=True),
-            factor(each.measures[name].ratio.value), probability(each.measures[name].p_value),
-        ]
-        for each in summary.comparisons
-        for name in COMPARED
-    ]  # fmt: skip
+    rows = []
+    for each in summary.comparisons:
+        name = "\n".join(filter(None, (versus(each), described(each.labels))))
+        for measure in COMPARED:
+            paired = each.measures[measure]
+            what = "no pair" if paired.p_value is None else _stacked(paired.difference, signed=True)
+            rows.append([
+                name, MEASURES[measure].title, str(each.pairs), what, factor(paired.ratio.value),
+                probability(paired.p_value),
+            ])  # fmt: skip
+            name = ""
+    return rows
 
 
 def _stacked(interval: Interval, *, signed: bool = False) -> str:
@@ -48,12 +51,14 @@ def _stacked(interval: Interval, *, signed: bool = False) -> str:
 
 def factor(value: float | None) -> str:
     """To a part in a thousand."""
-    return "" if value is None else f"{value:.3f}"
+    if value is None:
+        return ""
+    return f"{value:.3f}" if value < 10.0 else number(value)
 
 
 def versus(each: Comparison) -> str:
-    """``pidnn against pid``"""
-    return f"{shown(each.second)} against {shown(each.first)}"
+    """``law pidnn against pid``"""
+    return f"{each.key.rpartition('.')[2]} {shown(each.second)} against {shown(each.first)}"
 
 
 def flown(cell: CellSummary) -> str:
@@ -104,6 +109,11 @@ def shown(value: Any) -> str:
 
 def known(value: float | None, otherwise: str = "lost") -> str:
     return otherwise if value is None else number(value)
+
+
+def span(interval: Interval, said: Callable[[float | None], str] = known) -> str:
+    """``0.120 to 0.126``; a dash where there is none."""
+    return "–" if interval.low is None else f"{said(interval.low)} to {said(interval.high)}"
 
 
 def signed(value: float | None) -> str:
