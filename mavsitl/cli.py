@@ -117,6 +117,8 @@ examples:
   mavsitl tune my.toml --tune controller.position.k_p_per_s2=1:20 --tune controller.learning.rate=1:100:log
   mavsitl tune hover-wind --search-duration 20 --effort-weight 0.5 --output runs/gentle
   mavsitl tune --seeds 2001-2008 --held-out 50 --scheduler tcp://192.0.2.7:8786
+
+Exit codes: 0 done, whether something better was found or not; 1 it cannot go on; 2 wrong arguments; 130 interrupted.
 """
 
 VEHICLE_HELP = """\

@@ -6,6 +6,7 @@ what is allowed for whatever it does not accept.
 
 from __future__ import annotations
 
+import copy
 import re
 import sys
 import tomllib
@@ -520,7 +521,7 @@ def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
     """
     text, where, folder = _read("scenarios", name_or_path, names())
     data = _parse(text, where)
-    for key, value in (overrides or {}).items():
+    for key, value in copy.deepcopy(overrides or {}).items():  # one may be set within another
         _override(data, key, value, where)
     scenario = _convert(data, Scenario, where)
     reference = scenario.reference

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import msgspec
+import numpy as np
 
 from mavsitl.campaign.fly import Row
 from mavsitl.campaign.grid import Case, case
 from mavsitl.campaign.store import Journal
 from mavsitl.campaign.workers import Workers, fly_all
 from mavsitl.scenario import Flight, load
-from mavsitl.tune.objective import Score, Six, scale, score
+from mavsitl.tune.objective import Score, Six, scale, score, six
 from mavsitl.tune.space import Overrides, Space
 
 FlyAll: TypeAlias = Callable[[Sequence[Case]], Iterator[Row]]
@@ -64,18 +65,19 @@ class Flights:
     def scores(self, candidates: Sequence[tuple[float, ...]], fly_all: FlyAll) -> list[Score]:
         """In their order."""
         factors = self.factors or ((1.0,) * 6,) * len(self.names)
-        scales: list[Any] = []
-        durations_s = []
+        scales: list[Six] = []
+        durations_s: list[float] = []
         grid: list[list[list[Case]]] = []
         for values in candidates:
             grid.append([])
+            labels = {dial.key: value for dial, value in zip(self.space.dials, values, strict=True)}
             for name, factor in zip(self.names, factors, strict=True):
                 flight = self.flight(name, values)
                 whole = scale(flight.scenario)
-                scales.append(tuple(a * b for a, b in zip(whole, factor, strict=True)))
+                scales.append(six(np.multiply(whole, factor)))
                 flight = self._shortened(flight)
                 durations_s.append(flight.scenario.duration_s)
-                grid[-1].append([case(flight, seed) for seed in self.seeds])
+                grid[-1].append([case(flight, seed, labels) for seed in self.seeds])
         rows = {row.key: row for row in fly_all([each for of in grid for group in of for each in group])}
         n = len(self.names)
         return [score([[rows[each.key] for each in group] for group in of], scales[:n], durations_s[:n]) for of in grid]

@@ -23,3 +23,11 @@ def test_a_reference_of_another_kind_is_not_filled_up() -> None:
         load("rotor-failure", {"gcs_link.live": True, "wind": [], "reference": {"rate_rad_s": 1.0}})
     with pytest.raises(ScenarioError, match=r"controller\.position\.kp: unknown key; allowed here: k_p_per_s2"):
         load("hover-wind", {"controller.position.kp": 1.0})
+
+
+def test_what_was_handed_in_stays_as_it_was() -> None:
+    table = {"k_p_per_s2": 1.0, "k_i_per_s3": 2.0, "k_d_per_s": 3.0}
+    overrides = {"controller.position": table, "controller.position.k_p_per_s2": 7.0}
+    for _ in range(2):
+        assert load("hover-wind", overrides).scenario.controller.position.k_p_per_s2 == 7.0
+    assert table["k_p_per_s2"] == 1.0

@@ -77,6 +77,7 @@ def test_the_command_leaves_scenarios_that_fly_with_what_was_found(
     rows = (tmp_path / "run" / "rows.jsonl").read_text("utf-8").splitlines()
     candidates, judged = 4, 1 if record["chosen"] == 0 else 2
     assert len(record["trials"]) == candidates
+    assert json.loads(rows[0])["labels"] == {"controller.position.k_p_per_s2": 10.89, "controller.learning.rate": 10.0}
     assert len(rows) == 2 * (candidates + 1) + 2 * 2 * judged  # and the start's whole flights, to measure by
 
 
