@@ -64,9 +64,11 @@ def steps(
     state: Array, coefficients: Array, normals: Array, blows: bool,
 ) -> None:  # fmt: skip
     block = scratch(x.shape[1])
+    now_s = np.empty(x.shape[1])
     for k in range(count):
         if blows:
-            wind_step(state, coefficients, normals[k], k * DT_S, wind)
+            now_s[:] = k * DT_S
+            wind_step(state, coefficients, normals[k], now_s, wind)
         rk4_step(x, command, wind, parameters, DT_S, held, block)
 
 
@@ -106,14 +108,13 @@ def period(n: int) -> Run:
         simulation.set_demand(j, AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.0, 0.5))
     simulation.x[2] = 1.0e3
     start, s = simulation.x.copy(), simulation
-    wind_normals, sensor_normals = s._wind_block[0], s._sensor_block[0]
 
     def run(count: int) -> None:
         s.x[:] = start
         for k in range(count):
             tick.advance(
-                s.x, s.estimate, s.demand, s.gains, s.inner, s.held, s.plant, s.motors.rows, s._command, s.field.state,
-                s.field.coefficients, s.wind, wind_normals, sensor_normals, s.sigma, k * DT_S, s.dt_s, s.substeps,
+                s._rows, s._asked, s.held, s.field.state, s.field.coefficients, s._wind_normals.block,
+                s._sensor_normals.block, s._log, k, s.dt_s, s.substeps,
             )  # fmt: skip
 
     return run

@@ -98,7 +98,7 @@ def test_a_control_period_of_a_fleet_is_each_vehicle_s_own(n: int) -> None:
     demand[tick.KIND] = rng.choice([tick.STOPPED, tick.TORQUE_KIND, tick.RATE_KIND, tick.ATTITUDE_KIND], n)
     demand[tick.ATTITUDE : tick.ATTITUDE + 4] = [[1.0], [0.0], [0.0], [0.0]]
     demand[tick.THRUST] = 0.6
-    gains = np.full(tick.GAIN_ROWS, 0.1)
+    gains = np.full((tick.GAIN_ROWS, n), 0.1)
     gains[tick.MAX_ROTOR_SPEED] = PAPER.max_rotor_speed_rad_s
     gains[tick.THRUST_COEFFICIENT] = PAPER.thrust_coefficient_n_s2
     gains[tick.DRAG_COEFFICIENT] = PAPER.drag_coefficient_n_m_s2
@@ -106,22 +106,26 @@ def test_a_control_period_of_a_fleet_is_each_vehicle_s_own(n: int) -> None:
     motors[tick.FIXED_SPEED : tick.FIXED_SPEED + 4] = np.nan
     wind_normals = rng.standard_normal((periods, substeps * field.normals_per_step, n))
     sensor_normals = rng.standard_normal((periods, substeps * tick.GYRO_NORMALS + tick.MEASURE_NORMALS, n))
+    rows = np.zeros((tick.ROWS, n))
+    for begin, block in (
+        (tick.X, fleet.x), (tick.WIND_AT, fleet.wind), (tick.MOTORS_AT, motors), (tick.COMMAND_AT, fleet.command),
+        (tick.GAINS_AT, gains), (tick.PLANT_AT, fleet.parameters),
+    ):  # fmt: skip
+        rows[begin : begin + len(block)] = block
+    rows[tick.SIGMA_AT : tick.PLANT_AT] = 0.01
 
     def fly(columns: slice) -> Array:
-        arrays = fleet.x, fleet.wind, fleet.command, fleet.parameters, field.state, demand, motors
-        x, wind, command, plant, state, asked, rotors = (array[:, columns].copy() for array in arrays)
-        held = fleet.held[columns].copy()
-        estimate, inner = np.zeros((tick.ESTIMATE_ROWS, x.shape[1])), np.zeros((tick.INNER_ROWS, x.shape[1]))
+        own, state = rows[:, columns].copy(), field.state[:, columns].copy()
+        asked, held = demand.T[columns].copy(), fleet.held[columns].copy()
+        log = np.zeros((1, tick.LOG_WIDTH, own.shape[1]))
+        winds = np.ascontiguousarray(wind_normals[..., columns])
+        noise = np.ascontiguousarray(sensor_normals[..., columns])
         for k in range(periods):
-            tick.advance(
-                x, estimate, asked, gains, inner, held, plant, rotors, command, state, field.coefficients, wind,
-                np.ascontiguousarray(wind_normals[k][:, columns]), np.ascontiguousarray(sensor_normals[k][:, columns]),
-                np.full(4, 0.01), 0.0, 1.0e-3, substeps,
-            )  # fmt: skip
-        return np.concatenate([x, estimate, inner, state, wind])
+            tick.advance(own, asked, held, state, field.coefficients, winds, noise, log, k, 1.0e-3, substeps)
+        return np.concatenate([own, state, log[0]])
 
     together = fly(slice(None))
-    assert np.isfinite(together).all()
+    assert np.isfinite(together[: tick.X_ROWS]).all()
     for j in range(n):
         assert fly(slice(j, j + 1))[:, 0].tobytes() == together[:, j].tobytes()
 
