@@ -158,14 +158,14 @@ def from_attitude_target(
         yaw_rate = nan
     elif not abs(yaw_rate) <= LARGEST:
         return Refusal(f"SET_ATTITUDE_TARGET refused: body_yaw_rate is {yaw_rate:g}")
-    thrust = min(max(thrust, 0.0), 1.0)
+    thrust = 0.0 if thrust < 0.0 else 1.0 if thrust > 1.0 else thrust
     if use_attitude:
         w, x, y, z = q
         norm = sqrt(w * w + x * x + y * y + z * z)
         if not abs(norm - 1.0) <= NORM_TOLERANCE:
             return Refusal(f"SET_ATTITUDE_TARGET refused: |q| is {norm:.3g}, need 1")
         return AttitudeSetpoint(flip_quaternion(w / norm, x / norm, y / norm, z / norm), -yaw_rate, thrust)
-    if not _usable(roll_rate, pitch_rate):
+    if not (abs(roll_rate) <= LARGEST and abs(pitch_rate) <= LARGEST):
         return Refusal(f"SET_ATTITUDE_TARGET refused: body rates are {roll_rate:g}, {pitch_rate:g}")
     return RateSetpoint(flip_vector(roll_rate, pitch_rate, yaw_rate), thrust)
 
