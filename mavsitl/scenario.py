@@ -350,6 +350,9 @@ class Fleet(Section, frozen=True):
     """How often they are looked at."""
     on_collision: Literal["report", "crash"] = "report"
     """What it does: it is said to both and logged; or all rotors of both fail as well."""
+    stream_hz: Positive | None = None
+    """None: default streams as a single vehicle's. Else none is faster, and those that are due go out together; in real
+    time. What a client asks for is sent as it asks."""
 
 
 class Hover(Section, frozen=True, tag_field="kind", tag="hover"):

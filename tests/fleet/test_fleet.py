@@ -280,3 +280,39 @@ def test_a_formation_flies_to_its_places() -> None:
         assert each.rms_m < 0.5
     places = np.array(formation.places(scenario.scenario.fleet, 3)).T
     assert fleet.positions_nwu_m()[:2] == pytest.approx(places[:2], abs=0.3)
+
+
+# --- streams
+
+
+def test_default_streams_are_no_faster_than_the_scenario_says_and_vehicles_take_turns() -> None:
+    station = Station(4, flight(fleet__stream_hz=10.0))
+    station.inbox.clear()
+    station.datagrams.clear()
+    station.run(2.0)
+    for system_id in range(1, 5):
+        for own, most in ((0, 10.0), (1, 10.0)):
+            mine = [message.get_type() for port, sender, message in station.inbox if sender == system_id]
+            assert mine
+            names = [
+                message.get_type()
+                for port, sender, message in station.inbox
+                if (port, sender) == (2 * (system_id - 1) + own, system_id)
+            ]
+            counts = {name: names.count(name) / 2.0 for name in set(names)}
+            assert max(counts.values()) == most
+            assert counts["ATTITUDE"] == most
+            assert counts["HEARTBEAT"] == 1.0
+            datagrams = [port for port, _ in station.datagrams if port == 2 * (system_id - 1) + own]
+            assert len(datagrams) <= 2.0 * 3.0 * most
+    by_tick: list[int] = []
+    for _ in range(25):
+        station.datagrams.clear()
+        station.run(0.004)
+        by_tick.append(len({port // 2 for port, _ in station.datagrams}))
+    assert sum(count > 0 for count in by_tick) >= 4
+    station.command(0, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_ODOMETRY, 20_000)
+    station.inbox.clear()
+    station.run(1.0)
+    asked = [sender for port, sender, message in station.inbox if port == 0 and message.get_type() == "ODOMETRY"]
+    assert len(asked) == pytest.approx(50, abs=1)

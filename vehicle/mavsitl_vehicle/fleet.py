@@ -70,7 +70,8 @@ class Fleet:
         self.vehicles = [
             Vehicle(
                 flights[j], recorders[j], seed=seeds.of_vehicle(seed, j), system_id=system_id + j, ports=ports,
-                lockstep=lockstep, forwards=j == 0 or not one_link, seat=seat,
+                lockstep=lockstep, forwards=j == 0 or not one_link,
+                stream_hz=flight.scenario.fleet.stream_hz, seat=seat,
             )
             for j, seat in enumerate(seats)
         ]  # fmt: skip

@@ -90,6 +90,7 @@ class Vehicle:
         unix_us: Callable[[], int] | None = None,
         trusted: bool = True,
         forwards: bool = True,
+        stream_hz: float | None = None,
         seat: Seat | None = None,
     ) -> None:
         """`ports` name the links in order: "offboard", "gcs".
@@ -99,13 +100,15 @@ class Vehicle:
         a clock that does not jump, for SYSTEM_TIME and signatures; None: not known, and then there is no signing. A
         first signing key is taken only where the links are `trusted`: on loopback.
 
-        `forwards`: frames of others are passed on from link to link. `seat`: of a fleet; what it keeps, its state,
+        `forwards`: frames of others are passed on from link to link. `stream_hz`: default streams are no faster, and
+        go out together. `seat`: of a fleet; what it keeps, its state,
         logs and clock, are then the seat's. None: a fleet of one.
         """
         self.period_us = flight.scenario.rates.control_period_us
         self._flight = flight
         self.system_id = system_id
         self._forwards = forwards
+        self._stream_hz = stream_hz
         self._port_names = tuple(ports)
         self._lockstep = lockstep
         if seat is None:
@@ -180,7 +183,8 @@ class Vehicle:
         unix_us = 0 if kept.unix_us is None else kept.unix_us()
         autopilot = Autopilot(
             self._flight, self.system_id, self._port_names, self.parameters, _Body(simulation, j), kept.shared,
-            lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures, forwards=self._forwards,
+            lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures,
+            forwards=self._forwards, stream_hz=self._stream_hz,
         )  # fmt: skip
         autopilot.estimate = simulation.estimates[j]
         autopilot.estimator_status = simulation.estimator_status

@@ -115,10 +115,11 @@ class Autopilot:
         unix_boot_us: int = 0,
         failures: Failures | None = None,
         forwards: bool = True,
+        stream_hz: float | None = None,
     ) -> None:
         """`failures`: what is broken of the battery, the sticks, the links and, by what it is told, the motors.
 
-        `forwards`: frames of others are passed on from link to link.
+        `forwards`: frames of others are passed on from link to link. `stream_hz`: default streams are no faster.
         """
         scenario, airframe = flight.scenario, flight.airframe
         self.system_id = system_id
@@ -198,6 +199,7 @@ class Autopilot:
         self._housekept_us = -HOUSEKEEPING_US
         self._plan_watch = PlanWatch(shared.plan, self.origin, values, lambda text: self.warn("mission", text))
         self._fence_breach: str | None = None
+        self.stream_hz = stream_hz
         self._forwards = forwards and len(port_names) > 1
         self._router = Router(len(port_names), (system_id, COMPONENT_ID))
         self.ports = tuple(Port(name, index, self, shared, lockstep=lockstep) for index, name in enumerate(port_names))

@@ -102,7 +102,10 @@ class Port:
         signing = None if shared.signing is None else shared.signing.link(index, shared.trusted)
         self.node = Node(autopilot.system_id, COMPONENT_ID, signing)
         profile: telemetry.Profile = "gcs" if name == "gcs" else "offboard"
-        self.schedule = telemetry.Schedule("lockstep" if lockstep else profile)
+        most_hz = None if lockstep else autopilot.stream_hz
+        # Vehicles of a fleet take turns, each with all that it has to say.
+        turn_us = 0 if most_hz is None else int(autopilot.system_id * telemetry.GOLDEN % 1.0 * telemetry.HZ / most_hz)
+        self.schedule = telemetry.Schedule("lockstep" if lockstep else profile, start_us=turn_us, most_hz=most_hz)
         self.instance = OFFBOARD_LINK if profile == "offboard" else GCS_LINK
         """Of the failure unit MAVLINK."""
         self.down = False

@@ -1074,7 +1074,7 @@ STAGGER_US = 250_000
 """By when every stream has begun."""
 _AT_ONCE = ("HEARTBEAT", "SYS_STATUS")
 """What a client waits for: that the vehicle is there, and that it is ready to arm."""
-_GOLDEN = 0.618_033_988_749_895
+GOLDEN = 0.618_033_988_749_895
 """Multiples of it, modulo 1, fill an interval evenly however many there are."""
 
 _FOREVER = (2**63, -1, 1, send_heartbeat)
@@ -1092,9 +1092,10 @@ class Schedule:
         unsendable: messages left out because a value did not fit the wire (beyond what a float32 holds).
     """
 
-    def __init__(self, profile: Profile = "lockstep", *, start_us: int = 0) -> None:
-        """`start_us`: when the link opens."""
+    def __init__(self, profile: Profile = "lockstep", *, start_us: int = 0, most_hz: float | None = None) -> None:
+        """`start_us`: when the link opens. `most_hz`: default streams are no faster, and begin together then."""
         self._profile: Profile = profile
+        self._most_hz = inf if most_hz is None else most_hz
         self._streams = STREAMS
         self._interval = {stream.message_id: self.default_us(stream.message_id) for stream in self._streams}
         self._queue: list[tuple[int, int, int, Sampler]] = [_FOREVER]
@@ -1102,8 +1103,8 @@ class Schedule:
         for order, stream in enumerate(self._streams):
             interval_us = self._interval[stream.message_id]
             if interval_us != NEVER:
-                at_once = profile == "lockstep" or stream.name in _AT_ONCE
-                share = 0.0 if at_once else order * _GOLDEN % 1.0
+                at_once = profile == "lockstep" or most_hz is not None or stream.name in _AT_ONCE
+                share = 0.0 if at_once else order * GOLDEN % 1.0
                 due_us = start_us + int(share * min(interval_us, STAGGER_US))
                 self._queue.append((due_us, order, interval_us, stream.send))
         heapify(self._queue)
@@ -1119,6 +1120,7 @@ class Schedule:
                 hz = stream.offboard_hz
             case "lockstep":
                 hz = _LOCKSTEP_HZ.get(stream.name, NEVER)
+        hz = min(hz, self._most_hz)
         return round(HZ / hz) if hz else NEVER
 
     def interval_us(self, message_id: int) -> int:
