@@ -84,7 +84,7 @@ class Controller:
     def update(
         self, time_s: float, state: Observer, row: Floats, frames: int, lost: int, rejected: int, age_us: int
     ) -> Demand:
-        """One control cycle at flight time `time_s`; fills `row`, (cycle.COLUMNS,), the last four with it."""
+        """One control cycle at flight time `time_s`; fills `row`, (cycle.COLUMNS,), where the last four are columns."""
         self.reference.move(time_s)
         return self._cycle(
             self._memory, state.state, self.reference.now, row,
@@ -127,12 +127,12 @@ def _at_rest(flight: Flight) -> Record:
         filter=FirstOrder(settings.angle_filter_rad_s, period_s, rows=2).record(),
         observer=WindObserver(settings.wind_observer.horizontal_rad_s, settings.wind_observer.vertical_rad_s).record(),
         law=inner.law.record(),
+        wind=vector,  # W_1..W_3; the observer's state
+        desired=vector,  # phi_d, theta_d, psi_d; the filter's state
+        desired_rates=vector,
         # Filled in each period.
-        wind=vector,
         model=vector,
         yaw=[0.0],
-        desired=vector,
-        desired_rates=vector,
         direct=vector,
     )
 
