@@ -21,7 +21,7 @@ from mavsitl.link.budget import Excess, FairQueue, InputBudget
 from mavsitl.log.tlog import Direction
 
 LOOK_S = 0.001
-"""Real time: so often within a control period the sockets are looked at, which answers of services wait for."""
+"""Real time: between two looks at the sockets within a control period, so that what comes is taken together."""
 TAPS = 25
 """Logs are handed to the system in as many groups, a tick each."""
 SAY_LOST_US = 5_000_000
@@ -149,9 +149,11 @@ def run_realtime_fleet(
 
     with _selector(links) as selector:
 
-        def take() -> None:
-            ports = {key.data for key, _ in selector.select(0)}
-            ports.update(polled())
+        def take(limit_s: float = 0.0) -> None:
+            """What has come, or comes first within `limit_s`."""
+            ports = set(polled())
+            whole_ms = 0 if ports or intake.waiting else max(int(limit_s * 1e3), 0)  # a selector rounds up
+            ports.update(key.data for key, _ in selector.select(whole_ms * 1e-3))
             if ports or intake.waiting:
                 intake.take(ports, now_us, clock.time_us)
 
@@ -164,7 +166,7 @@ def run_realtime_fleet(
                 next_us = now_us + fleet.period_us
                 while clock.spare_s(next_us) > LOOK_S + GUARD_S:
                     clock.nap(LOOK_S)
-                    take()
+                    take(clock.spare_s(next_us) - GUARD_S)
                     send()
                 clock.wait_until(next_us)
                 take()

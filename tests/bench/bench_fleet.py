@@ -3,8 +3,8 @@
 A fleet in one process on one core; this process, on another where there is one, is what such a fleet has around it: it
 reads what all of them send on both links, says HEARTBEAT as a ground station, and streams off-board setpoints to each
 at 50 Hz, by which they take off and hover. The figure and the table are of the vehicles' process, by the system's
-account, while all fly: processor time for each second that was simulated, so that a machine with other work on it, on
-which real time is not kept, says much the same.
+account, while all fly: processor time for each second that was simulated. Setpoints go by the vehicles' clock, so that
+a machine with other work on it, on which real time is not kept, says much the same.
 """
 
 from __future__ import annotations
@@ -112,7 +112,11 @@ class Load:
         """Where each was at first, NED."""
         self.messages = 0
         self.boot_ms = 0
-        """Vehicle 1's clock, as last looked at."""
+        """Vehicle 1's clock, as last heard."""
+        self._since: tuple[float, int] | None = None
+        """Wall clock and vehicle 1's, a while ago."""
+        self._speed = 1.0
+        """Simulated over wall time, lately."""
 
     def send(self, j: int, message: Any) -> None:
         self._sockets[j].sendto(encode(message, self._sequence & 0xFF, *CLIENT), self._to[j])
@@ -128,7 +132,7 @@ class Load:
         while monotonic() < end_s:
             now_s = monotonic()
             if now_s >= self._next_s:
-                self._next_s = max(self._next_s + 1.0 / SETPOINT_HZ, now_s - 0.1)
+                self._next_s = max(self._next_s + 1.0 / (SETPOINT_HZ * self._speed), now_s - 0.1)
                 self._stream(now_s)
                 if done():
                     return True
@@ -147,10 +151,9 @@ class Load:
         try:
             while True:
                 datagram = opened.recv(4096)
-                if look:
+                self.messages += _frames(datagram)
+                if look or opened is self._sockets[0]:
                     self._look(datagram)
-                else:
-                    self.messages += _frames(datagram)
         except BlockingIOError:
             pass
 
@@ -164,7 +167,17 @@ class Load:
             elif message.get_type() == "LOCAL_POSITION_NED":
                 self.starts.setdefault(frame.system_id, (message.x, message.y, message.z))
                 if frame.system_id == 1:
-                    self.boot_ms = message.time_boot_ms
+                    self._keep_time(message.time_boot_ms)
+
+    def _keep_time(self, boot_ms: int) -> None:
+        now_s = monotonic()
+        self.boot_ms = boot_ms
+        if self._since is None:
+            self._since = now_s, boot_ms
+        elif now_s - self._since[0] > 1.0:
+            speed = (boot_ms - self._since[1]) / 1e3 / (now_s - self._since[0])
+            self._speed = min(max(speed, 0.01), 1.0)
+            self._since = now_s, boot_ms
 
     def _stream(self, now_s: float) -> None:
         for system_id, (x, y, z) in self.starts.items():
