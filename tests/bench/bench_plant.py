@@ -61,9 +61,8 @@ class Row(NamedTuple):
 @compiled
 def steps(
     count: int, x: Array, command: Array, wind: Array, parameters: Array, held: NDArray[np.bool_],
-    state: Array, coefficients: Array, normals: Array, blows: bool,
+    state: Array, coefficients: Array, normals: Array, blows: bool, block: Array | None,
 ) -> None:  # fmt: skip
-    block = scratch(x.shape[1])
     now_s = np.empty(x.shape[1])
     for k in range(count):
         if blows:
@@ -93,7 +92,7 @@ def ours(n: int, *, height_m: float = 1.0e3, blows: bool = False, draws: bool = 
         for done in range(0, count, BLOCK_STEPS):
             now = min(BLOCK_STEPS, count - done)
             normals = draw(now) if draws else drawn
-            steps(now, x, command, wind, parameters, held, field.state, field.coefficients, normals, blows)
+            steps(now, x, command, wind, parameters, held, field.state, field.coefficients, normals, blows, scratch(n))
 
     return run
 
@@ -114,7 +113,7 @@ def period(n: int) -> Run:
         for k in range(count):
             tick.advance(
                 s._rows, s._asked, s.held, s.field.state, s.field.coefficients, s._wind_normals.block,
-                s._sensor_normals.block, s._log, k, s.dt_s, s.substeps,
+                s._sensor_normals.block, s._log, s._block, k, s.dt_s, s.substeps,
             )  # fmt: skip
 
     return run

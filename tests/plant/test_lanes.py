@@ -83,7 +83,7 @@ def test_a_block_holds_all_rows() -> None:
     assert parameters_of(parameters, 3) == tuple(range(N_PARAMETERS))
     assert lanes.parameters_in(block, 3) == tuple(range(N_PARAMETERS))
     assert block.reshape(-1, LANES).shape[0] == 2 * N_STATES + 4 + 3 + N_PARAMETERS + 2
-    assert scratch(LANES - 1).size == 0
+    assert scratch(LANES - 1) is None
 
 
 @pytest.mark.parametrize("n", [16, 21])
@@ -121,7 +121,20 @@ def test_a_control_period_of_a_fleet_is_each_vehicle_s_own(n: int) -> None:
         winds = np.ascontiguousarray(wind_normals[..., columns])
         noise = np.ascontiguousarray(sensor_normals[..., columns])
         for k in range(periods):
-            tick.advance(own, asked, held, state, field.coefficients, winds, noise, log, k, 1.0e-3, substeps)
+            tick.advance(
+                own,
+                asked,
+                held,
+                state,
+                field.coefficients,
+                winds,
+                noise,
+                log,
+                scratch(own.shape[1]),
+                k,
+                1.0e-3,
+                substeps,
+            )
         return np.concatenate([own, state, log[0]])
 
     together = fly(slice(None))

@@ -18,6 +18,7 @@ from mavsitl_vehicle.autopilot.parameters import Parameters
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint
 from mavsitl_vehicle.failures import Failures, has_sensors
 from mavsitl_vehicle.motors import MotorFailures
+from mavsitl_vehicle.plant.lanes import scratch
 from mavsitl_vehicle.plant.parameters import plant_parameters
 from mavsitl_vehicle.plant.state import initial_state
 from mavsitl_vehicle.sensors import imu
@@ -105,6 +106,7 @@ class Simulation:
         self.demand[tick.ATTITUDE] = 1.0
         self._log = np.zeros((BLOCK_TICKS, tick.LOG_WIDTH, n))
         """The row of what is now is number `_tick`, modulo its length."""
+        self._block = scratch(n)
         self.held = np.full(n, scenario.start.clamp)
         self.at_rest = np.ones(n, dtype=np.bool_)
         for j in range(n):
@@ -300,7 +302,7 @@ class Simulation:
             return
         tick.advance(
             self._rows, self._asked, self.held, field.state, field.coefficients, self._wind_normals.block,
-            self._sensor_normals.block, self._log, number, self.dt_s, self.substeps,
+            self._sensor_normals.block, self._log, self._block, number, self.dt_s, self.substeps,
         )  # fmt: skip
         self.estimates = self.estimate.T.tolist()
 
@@ -313,7 +315,7 @@ class Simulation:
         tick.advance_sensed(
             self._rows, self._asked, self.held, field.state, field.coefficients, self._wind_normals.block,
             self._sensor_normals.block, unit.state, unit.late, unit.settings, unit.added, *sensed.failure_kinds(),
-            number, self.dt_s, self.substeps,
+            self._block, number, self.dt_s, self.substeps,
         )  # fmt: skip
         sensed.update(self.x, self.at_rest, self.estimate)
         self._present()
@@ -360,7 +362,7 @@ class Simulation:
             asked[:, tick.KIND] = kind
             tick.advance(
                 rows, asked, self.held, self.field.state.copy(), self.field.coefficients, self._wind_normals.block,
-                self._sensor_normals.block, self._log.copy(), 0, self.dt_s, self.substeps,
+                self._sensor_normals.block, self._log.copy(), self._block, 0, self.dt_s, self.substeps,
             )  # fmt: skip
 
     def _warm_up_sensed(self, rows: tick.Array, asked: tick.Array) -> None:
@@ -375,7 +377,7 @@ class Simulation:
                 tick.advance_sensed(
                     rows, asked, held, field.state.copy(), field.coefficients, self._wind_normals.block,
                     self._sensor_normals.block, unit.state, unit.late, unit.settings, unit.added, 0, 0,
-                    0, self.dt_s, self.substeps,
+                    self._block, 0, self.dt_s, self.substeps,
                 )  # fmt: skip
             sensed.update(x, held, estimate)
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from mavsitl.compiled import compiled
 from mavsitl.control.allocation import allocate
 from mavsitl_vehicle.autopilot.attitude import attitude_error, quaternion_product
-from mavsitl_vehicle.plant.lanes import scratch
 from mavsitl_vehicle.plant.parameters import N_PARAMETERS
 from mavsitl_vehicle.plant.step import rk4_step
 from mavsitl_vehicle.sensors import imu
@@ -251,6 +250,7 @@ def advance(
     wind_normals: Array,
     sensor_normals: Array,
     log: Array,
+    block: Array | None,
     tick: int,
     dt_s: float,
     substeps: int,
@@ -259,7 +259,7 @@ def advance(
 
     `rows` (ROWS, n), `asked` (n, DEMAND_ROWS) the demands, `log` (k, LOG_WIDTH, n), of which row (tick + 1) % k is
     filled. Of `wind_normals` (m, substeps * normals_per_step, n) and `sensor_normals` (m, substeps * 3 + 12, n) the
-    rows tick % m are consumed in order.
+    rows tick % m are consumed in order. `block` is `lanes.scratch(n)`.
     """
     x, estimate, wind = rows[X : X + X_ROWS], rows[ESTIMATE_AT:WIND_AT], rows[WIND_AT:INNER_AT]
     inner, motors, command = rows[INNER_AT:MOTORS_AT], rows[MOTORS_AT:COMMAND_AT], rows[COMMAND_AT:VELOCITY_AT]
@@ -272,7 +272,6 @@ def advance(
     outer_loop(demand, estimate, gains, inner)
     gyro = np.empty((3, n))
     now_s = np.empty(n)
-    block = scratch(n)
     winds, noise = wind_normals[tick % wind_normals.shape[0]], sensor_normals[tick % sensor_normals.shape[0]]
     per_step = winds.shape[0] // substeps
     for k in range(substeps):
@@ -304,6 +303,7 @@ def advance_sensed(
     imu_added: Array,
     gyro_kind: int,
     accel_kind: int,
+    block: Array | None,
     tick: int,
     dt_s: float,
     substeps: int,
@@ -325,7 +325,6 @@ def advance_sensed(
     gyro = np.empty((3, n))
     now_s = np.empty(n)
     before = np.empty((7, n))
-    block = scratch(n)
     winds, noise = wind_normals[tick % wind_normals.shape[0]], imu_normals[tick % imu_normals.shape[0]]
     per_step = winds.shape[0] // substeps
     imu.begin(imu_state, imu_settings, noise[substeps * imu.NORMALS :])

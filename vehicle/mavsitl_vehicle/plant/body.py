@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mavsitl_vehicle.plant.inlined import inlined
+from mavsitl.compiled import fused
 from mavsitl_vehicle.plant.parameters import (
     ARM,
     COUPLING,
@@ -22,7 +22,7 @@ from mavsitl_vehicle.plant.rotor import rotor_in_wind
 from mavsitl_vehicle.plant.state import Body, Rotors, Wind
 
 
-@inlined
+@fused
 def body_derivative(body: Body, rotors: Rotors, wind: Wind, parameters: Column) -> Body:
     """d/dt of a body (position, velocity, quaternion, rates) in free air, at these rotor speeds (rad/s)."""
     _, _, _, v_x, v_y, v_z, qw, qx, qy, qz, p, q, r = body

@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import sqrt
 from typing import TypeAlias
 
-from mavsitl_vehicle.plant.inlined import inlined
+from mavsitl.compiled import fused
 from mavsitl_vehicle.plant.parameters import (
     CONTACT_DAMPING,
     CONTACT_SINK_M,
@@ -34,7 +34,7 @@ Wrench: TypeAlias = tuple[float, float, float, float, float, float]
 """Force, N NWU, and moment about the mass centre, N m FLU."""
 
 
-@inlined
+@fused
 def leg_force(depth_m: float, sink_speed_m_s: float, stiffness: float, damping: float) -> float:
     """Normal force of one leg, N, for its depth below the ground and the speed at which that grows."""
     if depth_m <= 0.0:
@@ -48,7 +48,7 @@ def leg_force(depth_m: float, sink_speed_m_s: float, stiffness: float, damping: 
     return force
 
 
-@inlined
+@fused
 def with_leg(others: Wrench, leg_x: float, leg_y: float, body: Body, rotation: Rotation, parameters: Column) -> Wrench:
     """`others` and what the ground does to one more leg, its tip at `leg_x`, `leg_y` in the body."""
     force_x, force_y, force_z, moment_x, moment_y, moment_z = others
@@ -85,7 +85,7 @@ def with_leg(others: Wrench, leg_x: float, leg_y: float, body: Body, rotation: R
     )
 
 
-@inlined
+@fused
 def contact_derivative(body: Body, parameters: Column) -> Wrench:
     """What the ground adds to a vehicle's accelerations: linear (m/s^2 NWU) and angular (rad/s^2 FLU)."""
     _, _, _, _, _, _, qw, qx, qy, qz, _, _, _ = body

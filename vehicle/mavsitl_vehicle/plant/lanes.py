@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mavsitl.compiled import compiled
-from mavsitl_vehicle.plant.inlined import inlined
+from mavsitl.compiled import fused
 from mavsitl_vehicle.plant.parameters import N_PARAMETERS, Column
 from mavsitl_vehicle.plant.state import N_STATES, ROTOR, Array, Body, Rotors, Wind
 
@@ -29,13 +28,15 @@ TOUCHES = AFTER + N_STATES
 BLOCK_SIZE = (TOUCHES + 1) * LANES
 
 
-@compiled
-def scratch(n: int) -> Array:
-    """A block for stepping a fleet of `n`; empty for one that has not LANES vehicles."""
-    return np.empty(BLOCK_SIZE if n >= LANES else 0)
+def scratch(n: int) -> Array | None:
+    """A block for stepping a fleet of `n`; None for one that has not LANES vehicles.
+
+    With None a kernel is compiled without lanes, in half the time.
+    """
+    return np.empty(BLOCK_SIZE) if n >= LANES else None
 
 
-@inlined
+@fused
 def gather(block: Array, row: int, rows: int, source: Array, first: int) -> None:
     """Vehicles `first` and on of `source` (rows, n) into the rows from `row` on."""
     for i in range(rows):
@@ -43,7 +44,7 @@ def gather(block: Array, row: int, rows: int, source: Array, first: int) -> None
             block[(row + i) * LANES + lane] = source[i, first + lane]
 
 
-@inlined
+@fused
 def scatter(block: Array, row: int, rows: int, target: Array, first: int) -> None:
     """The way back."""
     for i in range(rows):
@@ -51,7 +52,7 @@ def scatter(block: Array, row: int, rows: int, target: Array, first: int) -> Non
             target[i, first + lane] = block[(row + i) * LANES + lane]
 
 
-@inlined
+@fused
 def body_in(block: Array, lane: int) -> Body:
     return (
         block[lane],
@@ -70,20 +71,20 @@ def body_in(block: Array, lane: int) -> Body:
     )
 
 
-@inlined
+@fused
 def four_in(block: Array, row: int, lane: int) -> Rotors:
     """Rotor speeds or commands."""
     at = row * LANES + lane
     return block[at], block[at + LANES], block[at + 2 * LANES], block[at + 3 * LANES]
 
 
-@inlined
+@fused
 def wind_in(block: Array, lane: int) -> Wind:
     at = WIND * LANES + lane
     return block[at], block[at + LANES], block[at + 2 * LANES]
 
 
-@inlined
+@fused
 def parameters_in(block: Array, lane: int) -> Column:
     b, n = block, LANES
     at = PARAMETERS * n + lane
@@ -96,7 +97,7 @@ def parameters_in(block: Array, lane: int) -> Column:
     )  # fmt: skip
 
 
-@inlined
+@fused
 def put_after(block: Array, lane: int, body: Body, rotors: Rotors) -> None:
     """A step's result into the rows AFTER."""
     at = AFTER * LANES + lane

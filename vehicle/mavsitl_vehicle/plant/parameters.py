@@ -11,8 +11,8 @@ from typing import TypeAlias
 import numpy as np
 
 from mavsitl.airframes import Airframe
+from mavsitl.compiled import fused
 from mavsitl.scenario import Offnominal
-from mavsitl_vehicle.plant.inlined import inlined
 from mavsitl_vehicle.plant.state import Array
 
 MASS = 0
@@ -109,7 +109,7 @@ def plant_parameters(airframe: Airframe, offnominal: Offnominal, ground_contact:
     return p
 
 
-@inlined
+@fused
 def parameters_of(parameters: Array, j: int) -> Column:
     """Of vehicle `j`."""
     p = parameters

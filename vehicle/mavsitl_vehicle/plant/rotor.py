@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from mavsitl_vehicle.plant.inlined import inlined
+from mavsitl.compiled import fused
 
 
-@inlined
+@fused
 def rotor_in_wind(
     omega_rad_s: float,
     wind_axial_m_s: float,
@@ -29,7 +29,7 @@ def rotor_in_wind(
     return thrust, drag, wind_force, wind_torque
 
 
-@inlined
+@fused
 def decay(steps_per_time_constant: float) -> tuple[float, float]:
     """exp(-h / 2 tau) and exp(-h / tau) for h / tau, any value from 0 to infinity.
 

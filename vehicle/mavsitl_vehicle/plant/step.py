@@ -11,11 +11,10 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from mavsitl.compiled import compiled
+from mavsitl.compiled import compiled, fused
 from mavsitl_vehicle.plant import lanes
 from mavsitl_vehicle.plant.body import body_derivative
 from mavsitl_vehicle.plant.contact import contact_derivative
-from mavsitl_vehicle.plant.inlined import inlined
 from mavsitl_vehicle.plant.lanes import LANES
 from mavsitl_vehicle.plant.parameters import (
     CONTACT_REACH,
@@ -29,7 +28,7 @@ from mavsitl_vehicle.plant.rotor import decay
 from mavsitl_vehicle.plant.state import N_STATES, ROTOR, VELOCITY, Array, Body, Rotors, Wind
 
 
-@inlined
+@fused
 def derivative(body: Body, rotors: Rotors, wind: Wind, parameters: Column, on_ground: bool) -> Body:
     """d/dt of a body; its legs touch the ground only if that is `on_ground` as well."""
     d = body_derivative(body, rotors, wind, parameters)
@@ -48,7 +47,7 @@ def derivative(body: Body, rotors: Rotors, wind: Wind, parameters: Column, on_gr
     return d
 
 
-@inlined
+@fused
 def along(x: Body, h: float, d: Body) -> Body:
     """x + h d."""
     return (
@@ -68,7 +67,7 @@ def along(x: Body, h: float, d: Body) -> Body:
     )
 
 
-@inlined
+@fused
 def lagged(command: Rotors, rotors: Rotors, remaining: float) -> Rotors:
     """Rotor speeds when `remaining` of the distance to the command is left."""
     return (
@@ -79,13 +78,13 @@ def lagged(command: Rotors, rotors: Rotors, remaining: float) -> Rotors:
     )
 
 
-@inlined
+@fused
 def clipped(speed: float, limit: float) -> float:
     """`speed` within 0 and `limit`."""
     return min(max(speed, 0.0), limit)
 
 
-@inlined
+@fused
 def body_of(x: Array, j: int) -> Body:
     """Rows 0:13 of vehicle `j`."""
     return (
@@ -105,19 +104,19 @@ def body_of(x: Array, j: int) -> Body:
     )
 
 
-@inlined
+@fused
 def four_of(rows: Array, first: int, j: int) -> Rotors:
     """Four rows from `first` on of vehicle `j`."""
     return rows[first, j], rows[first + 1, j], rows[first + 2, j], rows[first + 3, j]
 
 
-@inlined
+@fused
 def wind_of(wind_nwu_m_s: Array, j: int) -> Wind:
     """At vehicle `j`."""
     return wind_nwu_m_s[0, j], wind_nwu_m_s[1, j], wind_nwu_m_s[2, j]
 
 
-@inlined
+@fused
 def put(x: Array, j: int, body: Body, rotors: Rotors) -> None:
     """Into rows 0:17 of vehicle `j`."""
     x[0, j], x[1, j], x[2, j] = body[0], body[1], body[2]
@@ -127,7 +126,7 @@ def put(x: Array, j: int, body: Body, rotors: Rotors) -> None:
     x[ROTOR, j], x[ROTOR + 1, j], x[ROTOR + 2, j], x[ROTOR + 3, j] = rotors
 
 
-@inlined
+@fused
 def stepped(
     body: Body,
     rotors: Rotors,
@@ -173,7 +172,7 @@ def stepped(
     return still if held else flown, end, touches
 
 
-@inlined
+@fused
 def stepped_lane(block: Array, dt_s: float, lane: int, on_ground: bool) -> tuple[Body, Rotors, bool]:
     """`stepped` of one lane of a block."""
     return stepped(
@@ -196,36 +195,38 @@ def rk4_step(
     parameters: Array,
     dt_s: float,
     held: NDArray[np.bool_],
-    block: Array,
+    block: Array | None,
 ) -> None:
     """Advance `x` (17, n) in place by `dt_s`: LANES vehicles at a time, then the rest one by one.
 
     Commands (4, n) are clipped to what the rotors can do; ideal rotors take them at once. Wind is (3, n). A vehicle
-    that is `held` (n,) keeps its pose, with no velocity and no rates, while its rotors follow. `block` (BLOCK_SIZE,)
-    is scratch.
+    that is `held` (n,) keeps its pose, with no velocity and no rates, while its rotors follow. `block` is
+    `lanes.scratch(n)`.
     """
     n = x.shape[1]
-    alone = n - n % LANES
-    for first in range(0, alone, LANES):
-        lanes.gather(block, 0, N_STATES, x, first)
-        lanes.gather(block, lanes.COMMAND, 4, rotor_speed_command_rad_s, first)
-        lanes.gather(block, lanes.WIND, 3, wind_nwu_m_s, first)
-        lanes.gather(block, lanes.PARAMETERS, N_PARAMETERS, parameters, first)
-        for lane in range(LANES):
-            block[lanes.HELD * LANES + lane] = 1.0 if held[first + lane] else 0.0
-        # First as if all were in the air, and, if any was not, again.
-        for lane in range(LANES):
-            body, rotors, touches = stepped_lane(block, dt_s, lane, False)
-            lanes.put_after(block, lane, body, rotors)
-            block[lanes.TOUCHES * LANES + lane] = 1.0 if touches else 0.0
-        touching = 0.0
-        for lane in range(LANES):
-            touching += block[lanes.TOUCHES * LANES + lane]
-        if touching > 0.0:
+    alone = 0
+    if block is not None:
+        alone = n - n % LANES
+        for first in range(0, alone, LANES):
+            lanes.gather(block, 0, N_STATES, x, first)
+            lanes.gather(block, lanes.COMMAND, 4, rotor_speed_command_rad_s, first)
+            lanes.gather(block, lanes.WIND, 3, wind_nwu_m_s, first)
+            lanes.gather(block, lanes.PARAMETERS, N_PARAMETERS, parameters, first)
             for lane in range(LANES):
-                body, rotors, _ = stepped_lane(block, dt_s, lane, True)
+                block[lanes.HELD * LANES + lane] = 1.0 if held[first + lane] else 0.0
+            # First as if all were in the air, and, if any was not, again.
+            for lane in range(LANES):
+                body, rotors, touches = stepped_lane(block, dt_s, lane, False)
                 lanes.put_after(block, lane, body, rotors)
-        lanes.scatter(block, lanes.AFTER, N_STATES, x, first)
+                block[lanes.TOUCHES * LANES + lane] = 1.0 if touches else 0.0
+            touching = 0.0
+            for lane in range(LANES):
+                touching += block[lanes.TOUCHES * LANES + lane]
+            if touching > 0.0:
+                for lane in range(LANES):
+                    body, rotors, _ = stepped_lane(block, dt_s, lane, True)
+                    lanes.put_after(block, lane, body, rotors)
+            lanes.scatter(block, lanes.AFTER, N_STATES, x, first)
     for j in range(alone, n):
         body, rotors, _ = stepped(
             body_of(x, j),
