@@ -337,20 +337,18 @@ class _Port:
         return identity
 
     def _note(self, identity: _Identity, frame: Frame, now_us: int) -> None:
-        message = frame.message
-        raw = message.get_msgbuf()
-        kind = type(message).id
+        raw, kind = frame.raw, frame.message_id
         identity.messages[kind] += 1
         identity.octets[kind] += len(raw)
         identity.versions.add(1 if raw[0] == 0xFE else 2)
         identity.signed += frame.signed
         if kind == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-            identity.heartbeat = message
+            identity.heartbeat = frame.message
             identity.heartbeats += 1
         elif kind == AUTOPILOT_VERSION:
-            identity.version = message
-        elif kind == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and self._answers_us(message, identity):
-            identity.result = message.result
+            identity.version = frame.message
+        elif kind == mavlink.MAVLINK_MSG_ID_COMMAND_ACK and self._answers_us(frame.message, identity):
+            identity.result = frame.message.result
             identity.answer_us = now_us - identity.asked_us
 
     def _answers_us(self, message: Message, identity: _Identity) -> bool:

@@ -156,7 +156,7 @@ def _without_keys(datagram: bytes) -> bytes:
     """The good frames that are no SETUP_SIGNING: a key is not to be read in a log."""
     from mavsitl.codec import parse
 
-    kept = [bytes(f.message.get_msgbuf()) for f in parse(datagram) if type(f.message).id != SETUP_SIGNING]
+    kept = [frame.raw for frame in parse(datagram) if frame.message_id != SETUP_SIGNING]
     return b"".join(kept)
 
 

@@ -154,8 +154,10 @@ class Node:
             frames = self.signing.outgoing(frames, (self.system_id, self.component_id))
         if self.tamper is not None:
             frames = self.tamper.wire(frames)
-        if not combine:
+        if not combine or len(frames) < 2:
             return frames
+        if sum(map(len, frames)) <= max_bytes:
+            return [b"".join(frames)]
         datagrams: list[bytes] = []
         first = 0
         length = 0
@@ -177,14 +179,21 @@ class Node:
         frames = parse(datagram, self.counters)
         if self.signing is not None:
             frames = self.signing.incoming(frames, (self.system_id, self.component_id))
-        own = False
+        own, sources = self.address, self.sources
+        echoed = False
         for frame in frames:
-            if frame.system_id == self.system_id and frame.component_id == self.component_id:
-                own = True
+            sender = (frame.system_id, frame.component_id)
+            if sender == own:
+                echoed = True
+                continue
+            source = sources.get(sender)
+            if source is None:
+                source = self._meet(sender, frame.sequence)
             else:
-                self._note(frame)
-        if own:
-            others = [frame for frame in frames if (frame.system_id, frame.component_id) != self.address]
+                source.update(frame.sequence)
+            self._frames_heard = source.heard = self._frames_heard + 1
+        if echoed:
+            others = [frame for frame in frames if (frame.system_id, frame.component_id) != own]
             self.own_frames += len(frames) - len(others)
             return others
         return frames
@@ -199,20 +208,12 @@ class Node:
 
         A message without target fields is meant for everybody.
         """
-        message = frame.message
-        target_system = getattr(message, "target_system", 0)
-        if target_system not in (0, self.system_id):
-            return False
-        return getattr(message, "target_component", 0) in (0, self.component_id)
+        target_system, target_component = frame.target
+        return target_system in (0, self.system_id) and target_component in (0, self.component_id)
 
-    def _note(self, frame: Frame) -> None:
-        key = (frame.system_id, frame.component_id)
-        source = self.sources.get(key)
-        if source is None:
-            if len(self.sources) >= MAX_SOURCES:
-                del self.sources[min(self.sources, key=lambda known: self.sources[known].heard)]
-            source = self.sources[key] = SourceStatistics(frame.sequence)
-        else:
-            source.update(frame.sequence)
-        self._frames_heard += 1
-        source.heard = self._frames_heard
+    def _meet(self, sender: tuple[int, int], sequence: int) -> SourceStatistics:
+        """A sender not heard before, or forgotten."""
+        if len(self.sources) >= MAX_SOURCES:
+            del self.sources[min(self.sources, key=lambda known: self.sources[known].heard)]
+        source = self.sources[sender] = SourceStatistics(sequence)
+        return source

@@ -50,16 +50,15 @@ class Router:
         return [peer for peer, heard_us in self._heard_us[port].items() if now_us - heard_us <= TIMEOUT_US]
 
     def destinations(self, port: int, frame: Frame, now_us: int) -> tuple[int, ...]:
-        """The ports to which a frame that came by `port` goes on, as it is: ``frame.message.get_msgbuf()``.
+        """The ports to which a frame that came by `port` goes on, as it is: ``frame.raw``.
 
         A target component 0 is every component of the target system, a target system 0 everybody.
         """
-        message = frame.message
         sender = (frame.system_id, frame.component_id)
-        target_system = getattr(message, "target_system", 0)
-        target_component = getattr(message, "target_component", 0)
-        if sender == self._own or (target_system, target_component) == self._own or type(message).id in NOT_FORWARDED:
+        target = frame.target
+        if sender == self._own or target == self._own or frame.message_id in NOT_FORWARDED:
             return _NOWHERE
+        target_system, target_component = target
         found = []
         for other in range(len(self._heard_us)):
             if other == port:

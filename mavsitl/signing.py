@@ -81,7 +81,7 @@ UNSIGNED_ACCEPTED = frozenset(
 
 KEY_BYTES = 32
 
-_SETUP_CLASS = mavlink.MAVLink_setup_signing_message
+_SETUP_ID = mavlink.MAVLINK_MSG_ID_SETUP_SIGNING
 _HASH_BYTES = 6
 _HEADER_BYTES = 10
 _CRC_BYTES = 2
@@ -507,11 +507,11 @@ class LinkSigning:
         signing = self._signing
         if signing._key is None or not signing.active(self.trusted):
             for frame in frames:
-                if frame[0].__class__ is _SETUP_CLASS:
+                if frame.message_id == _SETUP_ID:
                     break
             else:
                 return frames
-        return [frame for frame in frames if frame[1:3] == own or self._passes(frame, own)]
+        return [frame for frame in frames if (frame.system_id, frame.component_id) == own or self._passes(frame, own)]
 
     def _outgoing(self, frame: bytes, own: tuple[int, int]) -> bytes:
         if frame[0] != _MAGIC_V2 or frame[2] or (frame[5], frame[6]) != own:
@@ -520,15 +520,14 @@ class LinkSigning:
         return self._signing.sign(frame, self.link_id)
 
     def _passes(self, frame: Frame, own: tuple[int, int]) -> bool:
-        signing, message = self._signing, frame.message
-        message_id = type(message).id
-        setup = message_id == _SETUP_CLASS.id
+        signing, message_id = self._signing, frame.message_id
+        setup = message_id == _SETUP_ID
         active = signing.active(self.trusted)
         if not (active or setup):
             return True
         verified = False
         if frame.signed and signing.has_key:
-            verdict = signing.check(message.get_msgbuf())
+            verdict = signing.check(frame.raw)
             name = _COUNTER[verdict]
             setattr(self.counters, name, getattr(self.counters, name) + 1)
             verified = verdict is Verdict.GOOD
@@ -541,8 +540,9 @@ class LinkSigning:
             else:
                 self.counters.unsigned_refused += 1
             return accepted
-        for_us = message.target_system in (0, own[0]) and message.target_component in (0, own[1])
-        if for_us and signing.setup(message, self.trusted, verified):
+        target_system, target_component = frame.target
+        for_us = target_system in (0, own[0]) and target_component in (0, own[1])
+        if for_us and signing.setup(frame.message, self.trusted, verified):
             self.counters.setups += 1
         else:
             self.counters.setups_refused += 1

@@ -228,9 +228,9 @@ class _Port:
             sender = (frame.system_id, frame.component_id)
             for mode in self._modes.values():
                 assert replaced is not None
-                message = replaced.message
-                if not _wants(mode.takes, type(message).id) or not self.node.addressed_to(frame):
+                if not _wants(mode.takes, replaced.message_id) or not self.node.addressed_to(frame):
                     continue
+                message = replaced.message
                 instead = mode.incoming(message, sender)
                 if instead is None:
                     replaced = None

@@ -146,7 +146,7 @@ def test_no_replay_after_a_kill_and_who_hears_the_vehicle_is_let_in(tmp_path: Pa
     assert [again.vehicle.receive(0, frame) for frame in recorded] == [0, 0, 0]
     assert again.command(signed=True) == 0  # its clock has not heard of ours
     assert again.all_signed()
-    heard = max(int.from_bytes(frame.message.get_msgbuf()[-12:-6], "little") for frame in again.frames)
+    heard = max(int.from_bytes(frame.raw[-12:-6], "little") for frame in again.frames)
     frame = KEY.sign(encode(message, 3, *GROUND), 1, max(heard, again.stamp) + 1)
     assert again.vehicle.receive(0, frame) == 1
     assert again.vehicle.receive(0, frame) == 0
@@ -157,9 +157,9 @@ def test_a_killed_vehicle_does_not_sign_a_stamp_twice(tmp_path: Path) -> None:
     ground.set_up()
     assert ground.vehicle.parameters.set("MAV_SIGN_CFG", ALWAYS) is None
     ground.run(2.0)
-    last = max(int.from_bytes(f.message.get_msgbuf()[-12:-6], "little") for f in ground.frames or _some(ground))
+    last = max(int.from_bytes(f.raw[-12:-6], "little") for f in ground.frames or _some(ground))
     again = Signer(tmp_path, begin_us=0)  # the system's clock was set back, too
-    first = min(int.from_bytes(f.message.get_msgbuf()[-12:-6], "little") for f in again.frames or _some(again))
+    first = min(int.from_bytes(f.raw[-12:-6], "little") for f in again.frames or _some(again))
     assert first > last
 
 

@@ -1,19 +1,48 @@
-"""Microseconds per message, encode and decode, beside pymavlink in the same run: ``python -m tests.bench.bench_codec``.
+"""Microseconds per message beside pymavlink in the same run: ``python -m tests.bench.bench_codec``.
 
-The ratios are what counts: absolute figures follow the machine's load, and both columns of a row are taken in turns.
+The messages are those of a flight: the default streams of both links and what the controller sends, each as it was on
+the wire, and the last row weighs them by how often they came. Three ways out and in are compared:
+
+- pack: fields to bytes. pymavlink's is ``mav.NAME_encode(...).pack(mav)``, which is what ``mav.NAME_send(...)`` does.
+- encode: an object to bytes. pymavlink's is ``message.pack(mav)``.
+- frame, fields, message: bytes to a checked frame, to all of its fields by a `reader`, and to a message object.
+  pymavlink's is ``mav.parse_buffer(datagram)`` for all three: it has no other way.
+
+Below the table stands the exchange of a control period as the two ends do it: what does not change (ODOMETRY's
+covariances) is packed once, and of the fields those are read that are used. pymavlink has no such choice.
+
+The ratios are what counts: absolute figures follow the machine's load, and the columns of a row are taken in turns, in
+CPU time, the best of several.
 """
 
 from __future__ import annotations
 
+import argparse
+import struct
+import time
 import timeit
-from collections.abc import Callable
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
-from mavsitl.codec import Counters, Message, encode, packer, parse
+from mavsitl import ends, scenario, wings
+from mavsitl.codec import Counters, Frame, Message, encode, packer, parse, reader
 from mavsitl.dialect import mavlink
 
-REPEATS = 7
-CALLS = 3000
+SCENARIO = "hover-wind"
+FLIGHT_S = 12.0
+USED = {
+    "ODOMETRY": (
+        "time_usec", "x", "y", "z", "q", "vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed", "frame_id",
+        "child_frame_id",
+    ),
+    "SET_ATTITUDE_TARGET": (
+        "time_boot_ms", "type_mask", "q", "body_roll_rate", "body_pitch_rate", "body_yaw_rate", "thrust",
+    ),
+}  # fmt: skip
+"""The two messages of every control period in lock-step, and what the other end reads of them."""
+REPEATS = 9
+CALLS = 1000
 
 
 def messages() -> list[Message]:
@@ -34,39 +63,135 @@ def messages() -> list[Message]:
     ]  # fmt: skip
 
 
-def _best_us(*functions: Callable[[], Any]) -> list[float]:
-    """Best time per call of each function, microseconds; the functions take turns, so that load meets all alike."""
-    timers = [timeit.Timer(function) for function in functions]
-    rounds = [[timer.timeit(CALLS) for timer in timers] for _ in range(REPEATS)]
-    return [min(column) / CALLS * 1e6 for column in zip(*rounds, strict=True)]
+class Row(NamedTuple):
+    """One message. Times are microseconds of CPU a message, ours first and pymavlink's second."""
+
+    name: str
+    per_s: float
+    pack: tuple[float, float]
+    encode: tuple[float, float]
+    frame: tuple[float, float]
+    fields: tuple[float, float]
+    message: tuple[float, float]
 
 
-def rows() -> list[tuple[str, list[float]]]:
-    """Per message, in microseconds: pack fields, encode object, pymavlink encode, parse, pymavlink parse."""
-    result = []
-    for message in messages():
-        reference = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-        wire = encode(message, 0, 1, 1)
-        pack = packer(type(message))
-        counters = Counters()
-        fields = [getattr(message, f"_{name}_raw", getattr(message, name)) for name in message.fieldnames]
-        times = _best_us(
-            lambda pack=pack, fields=fields: pack(7, 1, 1, *fields),  # type: ignore[misc]
-            lambda message=message: encode(message, 7, 1, 1),  # type: ignore[misc]
-            lambda message=message, reference=reference: message.pack(reference),  # type: ignore[misc]
-            lambda wire=wire, counters=counters: parse(wire, counters),  # type: ignore[misc]
-            lambda wire=wire, reference=reference: reference.parse_buffer(wire),  # type: ignore[misc]
-        )
-        result.append((message.msgname, times))
-    return result
+def traffic(duration_s: float) -> list[tuple[Frame, float]]:
+    """Each message of a flight with both links, as it was last seen, and how often per second; the frequent first."""
+    flight = scenario.load(SCENARIO, {"duration_s": duration_s})
+    seed = flight.scenario.seed
+    ports = ("offboard", "gcs")
+    vehicle = wings.find(wings.VEHICLE_GROUP)(flight, ends.NullRecorder(), seed=seed, ports=ports)
+    ground = wings.find(wings.GROUND_GROUP)(flight, ends.NullRecorder(), report=lambda text: None)
+    seen: dict[int, Frame] = {}
+    counts: Counter[int] = Counter()
+
+    def note(datagrams: Sequence[bytes]) -> Sequence[bytes]:
+        for datagram in datagrams:
+            for frame in parse(datagram):
+                seen[frame.message_id] = frame
+                counts[frame.message_id] += 1
+        return datagrams
+
+    now_us = 0
+    while not vehicle.finished:
+        vehicle.step(now_us)
+        note(vehicle.datagrams(1, combine=False))
+        for datagram in note(vehicle.datagrams(0, combine=True)):
+            ground.receive(0, datagram)
+        ground.step(ground.vehicle_time_us)
+        for datagram in note(ground.datagrams(0, combine=True)):
+            vehicle.receive(0, datagram)
+        now_us += vehicle.period_us
+    return [(seen[message_id], count / (now_us * 1e-6)) for message_id, count in counts.most_common()]
+
+
+def best_us(functions: Sequence[Callable[[], Any]], calls: int, repeats: int) -> list[float]:
+    """Best CPU time per call of each function, microseconds; the functions take turns, so that load meets all alike."""
+    timers = [timeit.Timer(function, timer=time.process_time) for function in functions]
+    rounds = [[timer.timeit(calls) for timer in timers] for _ in range(repeats)]
+    return [min(column) / calls * 1e6 for column in zip(*rounds, strict=True)]
+
+
+def measure(frame: Frame, per_s: float, *, as_used: bool = False, calls: int = CALLS, repeats: int = REPEATS) -> Row:
+    """One message, as `frame` has it. `as_used`: long arrays are packed before, and the fields in `USED` are read."""
+    message, counters = frame.message, Counters()
+    message_class = mavlink.mavlink_map[frame.message_id]
+    reference = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    theirs = reference.parse_buffer(frame.raw)[0]
+    fields = [getattr(theirs, f"_{name}_raw", getattr(theirs, name)) for name in message_class.fieldnames]
+    make = getattr(reference, f"{message_class.msgname.lower()}_encode")
+    given = [_packed(field) for field in fields] if as_used else fields
+    wanted = USED[message_class.msgname] if as_used else message_class.fieldnames
+    pack, read, wire = packer(message_class), reader(message_class, *wanted), frame.raw
+    pack_us, their_pack_us, encode_us, their_encode_us, frame_us, fields_us, message_us, parse_us = best_us(
+        (
+            lambda: pack(7, 1, 1, *given),
+            lambda: make(*fields).pack(reference),
+            lambda: encode(message, 7, 1, 1),
+            lambda: theirs.pack(reference),
+            lambda: parse(wire, counters),
+            lambda: read(parse(wire, counters)[0]),
+            lambda: parse(wire, counters)[0].message,
+            lambda: reference.parse_buffer(wire),
+        ),
+        calls,
+        repeats,
+    )
+    return Row(
+        message_class.msgname,
+        per_s,
+        (pack_us, their_pack_us),
+        (encode_us, their_encode_us),
+        (frame_us, parse_us),
+        (fields_us, parse_us),
+        (message_us, parse_us),
+    )
+
+
+def _packed(field: Any) -> Any:
+    return struct.pack(f"<{len(field)}f", *field) if isinstance(field, list) and len(field) > 8 else field
+
+
+def total(rows: Sequence[Row]) -> Row:
+    """All messages, each as often as it came: the mean message."""
+    per_s = sum(row.per_s for row in rows)
+
+    def mean(way: str) -> tuple[float, float]:
+        ours, theirs = (sum(row.per_s * getattr(row, way)[side] for row in rows) / per_s for side in (0, 1))
+        return ours, theirs
+
+    return Row("all, as often as sent", per_s, *map(mean, Row._fields[2:]))
+
+
+def line(row: Row) -> str:
+    ways = "".join(f"{ours:9.2f}{theirs / ours:6.1f}" for ours, theirs in row[2:])
+    return f"{row.name:32}{row.per_s:8.1f}{ways}"
 
 
 def main() -> None:
-    print(f"{'us per message':22}{'pack':>7}{'encode':>8}{'pymavlink':>11}{'ratio':>7}", end="")
-    print(f"{'parse':>9}{'pymavlink':>11}{'ratio':>7}")
-    for name, (pack, whole, their_pack, read, their_read) in rows():
-        print(f"{name:22}{pack:7.2f}{whole:8.2f}{their_pack:11.2f}{their_pack / whole:7.1f}", end="")
-        print(f"{read:9.2f}{their_read:11.2f}{their_read / read:7.1f}")
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--duration", type=float, default=FLIGHT_S, help="of the flight, s")
+    arguments.add_argument("--repeats", type=int, default=REPEATS)
+    given = arguments.parse_args()
+    ways = "".join(f"{way:>9}{'x':>6}" for way in Row._fields[2:])
+    print(f"{'us per message; x: pymavlink / us':32}{'per s':>7}{ways}")
+    flown = traffic(given.duration)
+    found = []
+    for frame, per_s in flown:
+        found.append(measure(frame, per_s, repeats=given.repeats))
+        print(line(found[-1]), flush=True)
+    print(line(total(found)))
+    exchanged = [
+        measure(frame, per_s, as_used=True, repeats=given.repeats)
+        for frame, per_s in flown
+        if mavlink.mavlink_map[frame.message_id].msgname in USED
+    ]
+    for row in exchanged:
+        print(line(row._replace(name=f"{row.name}, as used")))
+    ours, theirs = (sum(row.pack[side] + row.fields[side] for row in exchanged) for side in (0, 1))
+    print(
+        f"the exchange of a control period: {ours:.2f} us, pymavlink {theirs:.2f} us, {theirs / ours:.1f} times as long"
+    )
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from mavsitl.codec import Counters, encode, parse
+from mavsitl.codec import Counters, Reader, encode, parse, reader
 from mavsitl.dialect import mavlink
 from mavsitl.link.framing import LONGEST_FRAME_BYTES, StreamSplitter
 from mavsitl.scenario import ScenarioError
@@ -26,16 +26,33 @@ CORPUS = Path(__file__).parent / "corpus"
 PEER = (66, 1)
 
 
+@cache
+def _read_all(message_id: int) -> Reader:
+    kind = mavlink.mavlink_map[message_id]
+    return reader(kind, *kind.fieldnames)
+
+
 def parser(data: bytes) -> None:
-    """`codec.parse`: whatever it finds is in the datagram, frame by frame, and every byte is accounted for."""
+    """`codec.parse`: whatever it finds is in the datagram, frame by frame, and every byte is accounted for.
+
+    What it found can be read, both ways, and sent on.
+    """
     counters = Counters()
     frames = parse(data, counters)
-    taken = b"".join(bytes(frame.message.get_msgbuf()) for frame in frames)
+    taken = b"".join(frame.raw for frame in frames)
     begin = 0
     for frame in frames:
-        begin = data.index(bytes(frame.message.get_msgbuf()), begin) + len(frame.message.get_msgbuf())
+        begin = data.index(frame.raw, begin) + len(frame.raw)
     assert len(taken) + counters.skipped_bytes == len(data)
     assert counters.frames == len(frames)
+    for frame in frames:
+        message = frame.message
+        fields = _read_all(frame.message_id)(frame)
+        plain = [list(value) if isinstance(value, tuple | bytes) else value for value in fields]
+        assert repr(plain) == repr([getattr(message, name) for name in message.fieldnames])
+        assert frame.target == (getattr(message, "target_system", 0), getattr(message, "target_component", 0))
+        (again,) = parse(encode(message, frame.sequence, frame.system_id, frame.component_id))
+        assert repr(again.message.to_dict()) == repr(message.to_dict())
 
 
 def stream(data: bytes) -> None:

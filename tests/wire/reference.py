@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from mavsitl.codec import Message, MessageClass
+from mavsitl.codec import Frame, Message, MessageClass
 from mavsitl.dialect import mavlink
 
 CLASSES: list[MessageClass] = [mavlink.mavlink_map[message_id] for message_id in sorted(mavlink.mavlink_map)]
@@ -44,6 +44,11 @@ def frame_v1(message_class: MessageClass, payload: bytes, sequence: int = 0) -> 
     return b"\xfe" + head + payload + checksum(head + payload, message_class.crc_extra)
 
 
+def address_of(frame: Frame) -> tuple[int, int, int, bool]:
+    """System and component id, sequence number, and whether it is signed."""
+    return frame.system_id, frame.component_id, frame.sequence, frame.signed
+
+
 def pymavlink(sequence: int = 0, system_id: int = 1, component_id: int = 1) -> Any:
     """pymavlink's codec, about to send with this sequence number and address."""
     codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
@@ -53,13 +58,16 @@ def pymavlink(sequence: int = 0, system_id: int = 1, component_id: int = 1) -> A
 
 def assert_same_message(ours: Message, theirs: Message) -> None:
     """Every attribute that pymavlink's decoder sets is set alike: type, value, sign of zero, NaN."""
-    assert type(ours) is type(theirs)
-    our_attributes, their_attributes = dict(vars(ours)), dict(vars(theirs))
+    assert isinstance(ours, type(theirs))
+    their_attributes = dict(vars(theirs))
+    our_attributes = {name: getattr(ours, name) for name in their_attributes}
+    assert set(vars(ours)) <= set(their_attributes)
     assert vars(our_attributes.pop("_header")) == vars(their_attributes.pop("_header"))
     assert our_attributes.pop("_msgbuf") == bytes(their_attributes.pop("_msgbuf"))
     # Of a MAVLink 2 frame pymavlink keeps four bytes of the header as if they were payload; ours is the payload.
     payload = our_attributes.pop("_payload")
     assert bytes(their_attributes.pop("_payload")).endswith(payload)
     assert len(payload) == ours.get_header().mlen
-    assert repr(our_attributes) == repr({name: their_attributes[name] for name in our_attributes})
-    assert our_attributes.keys() == their_attributes.keys()
+    assert repr(our_attributes) == repr(their_attributes)
+    assert repr(ours.to_dict()) == repr(theirs.to_dict())
+    assert str(ours) == str(theirs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from mavsitl.codec import EncodeError, MessageClass, encode, packer, parse
 from mavsitl.dialect import mavlink
-from tests.wire.reference import CLASSES, NAMES, assert_same_message, frame_v1, frame_v2, pymavlink
+from tests.wire.reference import CLASSES, NAMES, address_of, assert_same_message, frame_v1, frame_v2, pymavlink
 
 every_message = pytest.mark.parametrize("message_class", CLASSES, ids=NAMES)
 few = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -31,7 +32,7 @@ def test_any_payload_reads_and_writes_as_pymavlink_does(
     (frame,) = parse(wire)
     theirs = pymavlink().decode(bytearray(wire))
     assert_same_message(frame.message, theirs)
-    assert frame[1:] == (system_id, component_id, sequence, False)
+    assert address_of(frame) == (system_id, component_id, sequence, False)
 
     expected = theirs.pack(pymavlink(sequence, system_id, component_id))
     assert encode(frame.message, sequence, system_id, component_id) == expected
@@ -48,7 +49,7 @@ def test_mavlink_1_reads_as_pymavlink_does(message_class: MessageClass, data: st
     wire = frame_v1(message_class, data.draw(st.binary(max_size=message_class.unpacker.size)), sequence=7)
     (frame,) = parse(wire)
     assert_same_message(frame.message, pymavlink().decode(bytearray(wire)))
-    assert frame[1:] == (1, 1, 7, False)
+    assert address_of(frame) == (1, 1, 7, False)
 
 
 @every_message
@@ -114,6 +115,17 @@ def test_packer_takes_byte_arrays_as_bytes_or_integers() -> None:
     pack = packer(mavlink.MAVLink_file_transfer_protocol_message)
     payload = bytes(range(251))
     assert pack(0, 1, 1, 0, 1, 1, payload) == pack(0, 1, 1, 0, 1, 1, list(payload))
+
+
+def test_packer_takes_a_long_array_as_the_bytes_of_the_wire() -> None:
+    pack = packer(mavlink.MAVLink_odometry_message)
+    before = (123, 1, 12, 1.0, 2.0, 3.0, (1.0, 0.0, 0.0, 0.0), *(0.5,) * 6)
+    pose, velocity = [0.25 * k for k in range(21)], [math.nan] * 21
+    octets, others = struct.pack("<21f", *pose), struct.pack("<21f", *velocity)
+    assert pack(7, 1, 1, *before, octets, others, 1, 2, 90) == pack(7, 1, 1, *before, pose, velocity, 1, 2, 90)
+    for wrong in (octets[:-1], octets + b"\0", b""):
+        with pytest.raises(EncodeError, match="pose_covariance needs exactly 84 bytes"):
+            pack(7, 1, 1, *before, wrong, others, 1, 2, 90)
 
 
 UNFIT = [

@@ -136,7 +136,7 @@ def test_frames_are_passed_on_byte_for_byte(router: Router) -> None:
     outside.send_message(HEARTBEAT)
     for found in inside.receive(b"".join(arriving)):
         assert 1 in router.destinations(0, found, 1)
-        outside.forward(found.message.get_msgbuf())
+        outside.forward(found.raw)
     outside.send_message(HEARTBEAT)
     first, *passed, last = outside.datagrams()
     assert passed == arriving

@@ -507,7 +507,7 @@ def test_combined_datagrams_of_signed_frames_stay_within_their_size() -> None:
     assert all(len(datagram) <= 200 for datagram in datagrams)
     frames = [frame for datagram in datagrams for frame in parse(datagram)]
     assert len(frames) == 50
-    assert all(KEY.verify(frame.message.get_msgbuf()) for frame in frames)
+    assert all(KEY.verify(frame.raw) for frame in frames)
     assert [frame.sequence for frame in frames] == list(range(50))
 
 

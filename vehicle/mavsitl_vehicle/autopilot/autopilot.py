@@ -210,22 +210,21 @@ class Autopilot:
         several = len(self.ports) > 1
         signed_only = node.signing is not None and node.signing.active
         for frame in frames if node.tamper is None else node.tamper.incoming(frames):
-            message = frame.message
             if several and (frame.signed or not signed_only):
                 self._router.note(port_index, (frame.system_id, frame.component_id), now_us)
             if node.addressed_to(frame):
                 try:
-                    handler = self._handlers.get(type(message).id)
+                    handler = self._handlers.get(frame.message_id)
                     if handler is not None:
-                        handler(message, frame, now_us)
-                    elif not port.receive(message, (frame.system_id, frame.component_id), now_us, at_us):
+                        handler(frame.message, frame, now_us)
+                    elif not port.receive(frame.message, (frame.system_id, frame.component_id), now_us, at_us):
                         node.counters.unsupported += 1
                 except Exception as error:
                     self._on_error(error, frame, port)
             if several:
                 for other in self._router.destinations(port_index, frame, now_us):
                     if not self.ports[other].down:
-                        self.ports[other].forward(message.get_msgbuf(), now_us)
+                        self.ports[other].forward(frame.raw, now_us)
         return sum(frame.signed for frame in frames) if signed_only else len(frames)
 
     def _on_error(self, error: Exception, frame: Frame, port: Port) -> None:
