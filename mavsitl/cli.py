@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
     from mavsitl.ask import Reply, Task
     from mavsitl.check import Heard, PortReport, Report
-    from mavsitl.ends import Outcome
+    from mavsitl.ends import Outcome, VehicleLinks
+    from mavsitl.fleet import FleetOutcome
+    from mavsitl.link.address import Address
     from mavsitl.report.run import FlightRecord
     from mavsitl.scenario import Flight
 
@@ -28,6 +30,8 @@ PAPER_SCENARIOS = ("hover-calm", "hover-wind", "spiral-calm", "spiral-wind")
 
 DEADLINE_S = 10.0
 CHECK_S = 3.0
+MAX_VEHICLES = 250
+"""In one process: system ids end at 255, and ground stations take the highest."""
 SLOWEST_SPEED = 0.5
 """Clients miss a HEARTBEAT after 3 s of wall clock."""
 
@@ -70,6 +74,7 @@ examples:
   mavsitl fly my.toml --seed 7 --level attitude      a file of your own
   mavsitl fly hover-wind --set noise.position_m=0.02 --set offnominal.mass_scale=1.3
   mavsitl fly --in-memory                            one process, no sockets, the same bytes
+  mavsitl fly formation-spiral --count 9             nine vehicles and their controllers in one process
 """
 
 VEHICLE_HELP = """\
@@ -85,6 +90,8 @@ examples:
   mavsitl vehicle hover-wind --instance 1            a second one: ports 18571, 14581, system id 2
   mavsitl vehicle hover-wind --bind 0.0.0.0 --insecure --offboard-remote 192.0.2.7:14540
   mavsitl vehicle --chaos ack-first-lost --chaos ftp-drops:0.3@gcs
+  mavsitl vehicle formation-spiral --count 9         nine in one process: system ids 1 to 9, ports 14580 to 14588
+  mavsitl vehicle formation-spiral --count 9 --one-link   nine behind the first one's ports
 """
 
 CHAOS_HELP = """\
@@ -105,6 +112,7 @@ examples:
   mavsitl ground hover-wind                          listens on udpin:127.0.0.1:14540, as PX4's users expect
   mavsitl ground hover-wind --link udpin:0.0.0.0:14540
   mavsitl ground spiral-calm --link udpout:192.0.2.9:14580 --system 3
+  mavsitl ground formation-spiral --count 9          for nine vehicles, at udpin:127.0.0.1:14540 to 14548
 """
 
 CHECK_HELP = """\
@@ -336,6 +344,7 @@ def _speed(text: str) -> float:
 
 _PORT = _whole(0, 65535)
 _SYSTEM = _whole(1, 255)
+_COUNT = _whole(1, MAX_VEHICLES)
 
 
 def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
@@ -373,6 +382,10 @@ def _add_fly(commands: Any) -> None:
     group = parser.add_argument_group("run")
     group.add_argument("--run-dir", type=Path, metavar="DIR", help="run folder (default: runs/<UTC time>)")
     group.add_argument("--in-memory", action="store_true", help="both ends in one process, no sockets; the same bytes")
+    group.add_argument(
+        "--count", type=_COUNT, metavar="N",
+        help="a formation of N vehicles, each with its controller, in one process; logs and a table, no report",
+    )  # fmt: skip
     group.add_argument("--no-report", action="store_true", help="logs and tables only")
     group.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
     parser.set_defaults(run=_fly)
@@ -393,6 +406,14 @@ def _add_vehicle(commands: Any) -> None:
         "--system", type=_SYSTEM, metavar="ID", help="MAVLink system id, 1 to 255 (default: instance + 1)"
     )
     group.add_argument(
+        "--count", type=_COUNT, metavar="N",
+        help="N vehicles in this process, the instances I and after it: each further one adds 1 to ports and system id",
+    )  # fmt: skip
+    group.add_argument(
+        "--one-link", action="store_true", default=None,
+        help="with --count: all behind the first one's ports, told apart by system id",
+    )  # fmt: skip
+    group.add_argument(
         "--bind", default="127.0.0.1", metavar="HOST", help="local address of all links (default: 127.0.0.1)"
     )
     group.add_argument(
@@ -403,7 +424,9 @@ def _add_vehicle(commands: Any) -> None:
         "--offboard-port", type=_PORT, metavar="N", help="local port of the off-board link (default: 14580 + I)"
     )
     group.add_argument(
-        "--offboard-remote", metavar="HOST:PORT", help="where it sends first (default: 127.0.0.1:14540 + I)"
+        "--offboard-remote",
+        metavar="HOST:PORT",
+        help="where it sends first (default: 127.0.0.1:14540 + I, at most 14549)",
     )
     group.add_argument(
         "--gcs-port", type=_PORT, metavar="N", help="local port of the ground-station link (default: 18570 + I)"
@@ -440,16 +463,26 @@ def _add_ground(commands: Any) -> None:
     group = parser.add_argument_group("link")
     group.add_argument(
         "--link",
-        default="udpin:127.0.0.1:14540",
         metavar="ENDPOINT",
-        help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or tcpin:HOST:PORT (default: udpin:127.0.0.1:14540)",
+        help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or tcpin:HOST:PORT "
+        "(default: udpin:127.0.0.1:14540 + I; from I = 10 on udpout:127.0.0.1:14580 + I)",
     )
     group.add_argument(
         "--system",
         type=_SYSTEM,
         metavar="ID",
-        help="fly only the vehicle with this system id (default: the first heard)",
+        help="fly only the vehicle with this system id (default: the first heard; with --count, of the first: I + 1)",
     )
+    group.add_argument(
+        "--count", type=_COUNT, metavar="N", help="fly N vehicles in the scenario's formation, each on its own port"
+    )
+    group.add_argument(
+        "--one-link", action="store_true", default=None, help="with --count: all of them are heard at --link"
+    )
+    group.add_argument(
+        "--instance", type=_whole(0, 254), default=0, metavar="I",
+        help="adds I to the default's port; with --count, of the first vehicle (default: 0)",
+    )  # fmt: skip
     group.add_argument(
         "--vehicle",
         metavar="HOST:PORT",
@@ -644,6 +677,8 @@ def _fly(options: argparse.Namespace) -> int:
     settings = _settings(options)
     names = options.scenarios or list(PAPER_SCENARIOS)
     flights = [_load(name, settings) for name in names]
+    if options.count is not None:
+        return _fly_fleet(options, flights)
     created = utc_stamp()
     folder: Path = options.run_dir or Path("runs") / created.replace(":", "").replace("-", "")
     console = Console(stderr=options.json)
@@ -665,6 +700,38 @@ def _fly(options: argparse.Namespace) -> int:
         console.print(f"interrupted; the logs so far are in {folder}")
         raise
     return _show(console, options, folder, records)
+
+
+def _fly_fleet(options: argparse.Namespace, flights: list[Flight]) -> int:
+    """A formation in memory; there is no page for one, each vehicle's logs have a folder."""
+    from rich.console import Console
+
+    from mavsitl import ends
+    from mavsitl.clock import utc_stamp
+
+    if len(flights) != 1:
+        raise UsageError(f"--count: one scenario, not {len(flights)}")
+    (flight,) = flights
+    folder: Path = options.run_dir or Path("runs") / utc_stamp().replace(":", "").replace("-", "")
+    console = Console(stderr=True)
+    with console.status(f"{flight.name}, {options.count} vehicles") as shown:
+
+        def move(time_s: float) -> None:
+            shown.update(f"{flight.name}, {options.count} vehicles: {max(time_s, 0.0):.1f} s")
+
+        outcome = ends.fleet_in_memory(
+            flight, folder / flight.name, count=options.count, report=lambda text: None, progress=move
+        )
+    if options.json:
+        import msgspec
+
+        event = outcome.as_event() | {"folder": str(folder)}
+        print(msgspec.json.format(msgspec.json.encode(event), indent=2).decode())
+    else:
+        for line in _fleet_table(outcome):
+            print(line)
+        print(f"logs: {folder}")
+    return EXIT_FAILED if outcome.lost or not outcome.finished else EXIT_OK
 
 
 def _fly_one(
@@ -833,11 +900,49 @@ class _Status:
                 f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
             )
 
+    def end_fleet(self, outcome: FleetOutcome) -> None:
+        if self._as_json:
+            self._print(outcome.as_event())
+            return
+        for line in _fleet_table(outcome):
+            print(line)
+
     def _print(self, event: dict[str, Any]) -> None:
         import msgspec
 
         sys.stdout.write(msgspec.json.encode(event).decode() + "\n")
         sys.stdout.flush()
+
+
+def _fleet_table(outcome: FleetOutcome) -> list[str]:
+    """For a person: each vehicle in a line, and what is of all."""
+    total = f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time"
+    lines = [f"{total}; {outcome.frames} frames in, {len(outcome.vehicles)} vehicles"]
+    if any(each.rms_m is not None for each in outcome.vehicles):
+        lines.append(f"{'vehicle':>7} {'flown s':>8} {'rms m':>7} {'worst m':>8}  end")
+        for each in outcome.vehicles:
+            error = f"{'-':>7} {'-':>8}" if each.rms_m is None else f"{each.rms_m:7.3f} {each.worst_m:8.3f}"
+            end = f"lost: {each.lost}" if each.lost else "as planned" if each.finished else "not flown to its end"
+            lines.append(f"{each.system_id:7d} {each.flight_time_s:8.1f} {error}  {end}")
+    for collision in outcome.collisions:
+        lines.append(
+            f"collision of vehicles {collision.vehicle} and {collision.other} at t = {collision.time_s:.2f} s: "
+            f"{collision.distance_m:.2f} m"
+        )
+    if outcome.dropped:
+        lines.append("dropped: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
+    for each in outcome.vehicles:
+        for place, directions in each.link.items():
+            for direction, counts in directions.items():
+                shown = ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
+                lines.append(f"vehicle {each.system_id}, {place} {direction}: {shown}")
+    if outcome.lateness_us is not None:
+        p50, p99 = outcome.lateness_us
+        lines.append(
+            f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; "
+            f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
+        )
+    return lines
 
 
 def _check_effect(options: argparse.Namespace, end: str, names: Sequence[str]) -> None:
@@ -870,6 +975,75 @@ def _state_folder(options: argparse.Namespace, system_id: int) -> Path | None:
     return user_data_path("mavsitl", appauthor=False) / f"vehicle-{system_id}"
 
 
+def _fleet_states(options: argparse.Namespace, system_id: int, count: int) -> list[Path | None]:
+    """Of each vehicle: in ``instance-<I>`` of a folder that is named, else where it would be of each alone."""
+    folders: list[Path | None] = []
+    for each in range(system_id, system_id + count):
+        folder = _state_folder(options, each)
+        folders.append(folder if folder is None or options.state_dir is None else folder / f"instance-{each - 1}")
+    return folders
+
+
+def _check_fleet(options: argparse.Namespace, system_id: int) -> int:
+    """The number of vehicles of a fleet; 0: it is no fleet."""
+    if options.count is None:
+        if options.one_link:
+            raise UsageError("--one-link: only with --count")
+        return 0
+    if options.lockstep:
+        raise UsageError("--count: not with --lockstep; mavsitl fly --count flies a formation in lock-step")
+    count: int = options.count
+    if system_id + count - 1 > MAX_VEHICLES:
+        last = system_id + count - 1
+        raise UsageError(f"--count {count}: system ids {system_id} to {last}; allowed: up to {MAX_VEHICLES}")
+    return count
+
+
+def _fleet(options: argparse.Namespace, flight: Flight, first: VehicleLinks, system_id: int, count: int) -> int:
+    """`first`: the links of the first vehicle."""
+    import dataclasses
+
+    from mavsitl import ends
+
+    if options.tcp_port is not None and not options.one_link:
+        raise UsageError("--tcp-port: with --count only with --one-link")
+    host, port = first.offboard_remote
+
+    def remote(j: int) -> int:
+        return port + j if options.offboard_remote else ends.offboard_remote_port(options.instance + j)
+
+    links = [
+        dataclasses.replace(
+            first, offboard_port=first.offboard_port + j, offboard_remote=(host, remote(j)), gcs_port=first.gcs_port + j
+        )
+        for j in range(1 if options.one_link else count)
+    ]
+    last = links[-1]
+    for name, used in (
+        ("--offboard-port", last.offboard_port),
+        ("--offboard-remote", last.offboard_remote[1]),
+        ("--gcs-port", last.gcs_port),
+    ):
+        if used > 65535:
+            raise UsageError(f"{name}: {count} vehicles would need ports up to {used}; allowed: up to 65535")
+    status = _Status(options.status == "json")
+    where = "all on one link" if options.one_link else "each further one's ports 1 higher"
+    status.say(
+        f"vehicles {system_id} to {system_id + count - 1} ({flight.name}): "
+        f"off-board {first.bind}:{first.offboard_port} -> {host}:{port}, ground station {first.bind}:{first.gcs_port} "
+        f"-> {first.gcs_remote[0]}:{first.gcs_remote[1]}, {where}; Ctrl-C ends it"
+    )
+    for window in flight.scenario.chaos:
+        status.say(f"misbehaves: {window.mode} on port {window.port}")
+    outcome = ends.fleet_realtime(
+        flight, links, options.run_dir, count=count, system_id=system_id, wing=options.wing,
+        speed=options.speed or 1.0, until_finished=bool(options.until_disarmed),
+        states=_fleet_states(options, system_id, count), report=status.say, stop=status.stop, progress=None,
+    )  # fmt: skip
+    status.end_fleet(outcome)
+    return EXIT_OK
+
+
 def _with_chaos(flight: Flight, modes: Sequence[str]) -> Flight:
     """The scenario's, and these from the start on. Raises `ChaosError`."""
     if not modes:
@@ -891,7 +1065,7 @@ def _vehicle(options: argparse.Namespace) -> int:
     flight = _with_chaos(_load(options.scenario, _settings(options)), options.chaos or ())
     instance = options.instance
     system_id = options.system if options.system is not None else instance + 1
-    offboard_remote = options.offboard_remote or f"127.0.0.1:{ends.OFFBOARD_REMOTE_PORT + instance}"
+    offboard_remote = options.offboard_remote or f"127.0.0.1:{ends.offboard_remote_port(instance)}"
     links = ends.VehicleLinks(
         bind=options.bind,
         offboard_port=options.offboard_port if options.offboard_port is not None else ends.OFFBOARD_PORT + instance,
@@ -912,6 +1086,8 @@ def _vehicle(options: argparse.Namespace) -> int:
         ),
         lockstep_only=("--deadline", "--cpu"),
     )  # fmt: skip
+    if count := _check_fleet(options, system_id):
+        return _fleet(options, flight, links, system_id, count)
     status = _Status(options.status == "json")
     if options.lockstep:
         outcome = ends.vehicle_lockstep(
@@ -947,9 +1123,12 @@ def _ground(options: argparse.Namespace) -> int:
     from mavsitl.link.address import parse_address
 
     flight = _load(options.scenario, _settings(options))
-    address = parse_address(options.link)
+    address = parse_address(options.link) if options.link else ends.ground_address(options.instance)
     _check_effect(options, "ground", ("--seed",))
     _check_lockstep(options, real_time_only=(), lockstep_only=("--deadline", "--cpu", "--vehicle"))
+    first_id = options.system if options.system is not None else options.instance + 1
+    if count := _check_fleet(options, first_id):
+        return _ground_fleet(options, flight, address, first_id, count)
     status = _Status(options.status == "json")
     if options.lockstep:
         if not address.kind.startswith("udp"):
@@ -968,6 +1147,32 @@ def _ground(options: argparse.Namespace) -> int:
             vehicle_system_id=options.system, wing=options.wing, report=status.say, stop=status.stop, progress=None,
         )  # fmt: skip
     status.end(outcome)
+    return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED
+
+
+def _ground_fleet(options: argparse.Namespace, flight: Flight, first: Address, system_id: int, count: int) -> int:
+    """`first`: where the first vehicle, or all of them, are heard."""
+    from mavsitl import ends
+    from mavsitl.link.address import Address
+
+    links = 1 if options.one_link else count
+    if first.port + links - 1 > 65535:
+        raise UsageError(f"--link {first}: {count} vehicles would need ports up to {first.port + links - 1}")
+    addresses = [
+        Address(first.kind, first.host, first.port + j) if options.link else ends.ground_address(options.instance + j)
+        for j in range(links)
+    ]
+    status = _Status(options.status == "json")
+    where = first if links == 1 else f"{first} to {addresses[-1]}"
+    status.say(
+        f"ground ({flight.name}): waiting for vehicles {system_id} to {system_id + count - 1} on {where}; "
+        "Ctrl-C ends it"
+    )
+    outcome = ends.ground_fleet(
+        flight, addresses, options.run_dir, count=count, first_system_id=system_id, wing=options.wing,
+        report=status.say, stop=status.stop,
+    )  # fmt: skip
+    status.end_fleet(outcome)
     return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED
 
 

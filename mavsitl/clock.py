@@ -174,6 +174,10 @@ class PacedClock:
             self.lost_us += (now_ns - due_ns) // 1000
         self.now_us = tick_us
 
+    def nap(self, seconds: float) -> None:
+        """Sleep for so long, whatever is due."""
+        self._sleep_s(seconds)
+
     def spare_s(self, tick_us: int) -> float:
         """Wall time until `wait_until` would wait for `tick_us` awake, seconds; 0 or less when there is none."""
         due_ns = self._origin_ns + round(tick_us * 1000 / self.speed)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import errno
+import inspect
 import ipaddress
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mavsitl import __version__, drivers, wings
+from mavsitl import __version__, drivers, fleet, wings
 from mavsitl.clock import monotonic_us, unix_us
 from mavsitl.drivers import Progress, RealTime, Tap
+from mavsitl.fleet import FleetOutcome, Flown
 from mavsitl.herald import Herald
 from mavsitl.link.address import Address
 from mavsitl.link.base import Link, LinkError
@@ -24,7 +26,7 @@ from mavsitl.link.settings import PLACES
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
 from mavsitl.log.errors import Failed, LogError
 from mavsitl.log.tlog import TlogWriter
-from mavsitl.scenario import Flight, LinkModel
+from mavsitl.scenario import Flight, LinkModel, ScenarioError
 
 if TYPE_CHECKING:
     from mavsitl.ask import Reply, Task
@@ -38,6 +40,20 @@ WIRE_LOG = "link.tlog"
 GCS_PORT, GCS_REMOTE_PORT = 18570, 14550
 OFFBOARD_PORT, OFFBOARD_REMOTE_PORT = 14580, 14540
 """PX4 SITL's: each is raised by the instance."""
+REMOTE_INSTANCES = 10
+"""From this instance on all send to the off-board port of the one before it, as PX4's do: higher ones are others'."""
+
+
+def offboard_remote_port(instance: int) -> int:
+    """Where an instance's off-board link sends first."""
+    return OFFBOARD_REMOTE_PORT + min(instance, REMOTE_INSTANCES - 1)
+
+
+def ground_address(instance: int) -> Address:
+    """Where a program meets an instance that nobody told otherwise: it is sent to, or has to speak first."""
+    if instance < REMOTE_INSTANCES:
+        return Address("udpin", LOOPBACK, OFFBOARD_REMOTE_PORT + instance)
+    return Address("udpout", LOOPBACK, OFFBOARD_PORT + instance)
 
 
 @dataclass(frozen=True)
@@ -113,14 +129,14 @@ def _subscribe(core: Any, listener: Callable[[LinkName, Overlay], None]) -> None
 class _LiveLinks:
     """The vehicle's links in real time. One that is perfect has nothing before it until a parameter makes it bad."""
 
-    def __init__(self, links: list[Link], flight: Flight, speed: float) -> None:
-        """`links` in the order of the ports; elements of the list are replaced."""
+    def __init__(self, links: list[Link], flight: Flight, speed: float, seed: int | None = None) -> None:
+        """`links` in the order of the ports; elements of the list are replaced. `seed`: None is the scenario's."""
         self.channels: dict[str, Channels] = {}
         """By place; those that there are."""
         self.flight_time_s: Callable[[], float] = lambda: -1.0
         self._links = links
         self._impaired: list[ImpairedLink] = []
-        self._seed = flight.scenario.seed
+        self._seed = flight.scenario.seed if seed is None else seed
         self._speed = speed
         self._start_us = monotonic_us()
         scenario = flight.scenario
@@ -470,6 +486,244 @@ def in_memory(
         limit_s = inf if channels is None else flight.scenario.duration_s + IMPAIRED_GRACE_S
         end_us = drivers.fly_in_memory(vehicle, ground, tap, max_time_s=limit_s, progress=progress, channels=channels)
         return watch.outcome(end_us, tap, links=_statistics(channels), heard_by=vehicle)
+
+
+# --- fleets ----------------------------------------------------------------------------------------------------------
+
+
+def _fleet_folder(folder: Path | None, number: int) -> Path | None:
+    """Of the logs of one vehicle, or controller, of many."""
+    return None if folder is None else folder / f"vehicle-{number}"
+
+
+def _many(build: Any, *arguments: Any, count: int, **options: Any) -> Any:
+    """A wing's core of many. Raises `WingError` for a wing that has none."""
+    if "count" not in inspect.signature(build).parameters:
+        raise wings.WingError(f"{build.__module__} flies one vehicle: it takes no --count")
+    return build(*arguments, count=count, **options)
+
+
+def _open_pair(links: VehicleLinks, hint: str) -> list[Link]:
+    """The off-board and the ground stations' link; `hint` is the option that moves all ports."""
+    opened: list[Link] = []
+    try:
+        for port, remote, option in (
+            (links.offboard_port, links.offboard_remote, "--offboard-port N"),
+            (links.gcs_port, links.gcs_remote, "--gcs-port N"),
+        ):
+            opened.append(
+                UdpLink((links.bind, port), remote, port_option=f"{option} or {hint}", host_option="--bind HOST")
+            )
+        if links.tcp_port is not None:
+            from mavsitl.link.tcp import TcpServerLink
+
+            opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
+    except LinkError:
+        for link in opened:
+            link.close()
+        raise
+    return opened
+
+
+def fleet_realtime(
+    flight: Flight, links: Sequence[VehicleLinks], folder: Path | None, *,
+    count: int, system_id: int, wing: str | None, speed: float, until_finished: bool, states: Sequence[Path | None],
+    report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
+) -> FleetOutcome:  # fmt: skip
+    """`count` vehicles on the wall clock in this process. `links`: each one's, or those that all are behind.
+
+    `folder` gets the logs of each in a folder ``vehicle-<instance>``, the instance being its system id less 1; `states`
+    are what each keeps. Raises as `vehicle_realtime`.
+    """
+    from mavsitl import seeds  # here, for it loads numpy
+
+    one_link = len(links) < count
+    for each in links:
+        _check_exposed_fleet(each, report)
+    core: Any = None
+
+    def log_failed(error: LogError) -> None:
+        text = f"Logging has ended: {error}"
+        report(text)
+        if core is not None:
+            core.warn(text)
+
+    opened: list[list[Link]] = []
+    with ExitStack() as stack:
+        for each in links:
+            group = _open_pair(each, "--instance I")
+            opened.append(group)
+            stack.callback(_close_all, group)  # the list, for its elements are replaced
+        folders = [_fleet_folder(folder, system_id - 1 + j) for j in range(count)]
+        logs = [stack.enter_context(_logs(each, "vehicle", flight, log_failed)) for each in folders]
+        core = _many(
+            wings.find(wings.VEHICLE_GROUP, wing), flight, [recorder for recorder, _ in logs], count=count,
+            seed=flight.scenario.seed, system_id=system_id, one_link=one_link,
+            ports=("offboard", *["gcs"] * (len(opened[0]) - 1)), states=states, logs=folders,
+            unix_us=_steady_unix_clock(), trusted=is_loopback(links[0].bind),
+        )  # fmt: skip
+        per_group = len(opened[0])
+        ports = _Ports(opened)
+        lives = []
+        for j, group in enumerate(opened):
+            vehicle = core.vehicles[j]
+            live = _LiveLinks(group, flight, speed, seed=seeds.of_vehicle(flight.scenario.seed, j))
+            live.flight_time_s = _flight_time_of(vehicle)
+            _subscribe(vehicle, live.listen)
+            lives.append(live)
+            if folder is not None:
+                from mavsitl.log.links import LinkLog
+
+                logs[j][1].record = LinkLog(logs[j][0], _channels_of(live)).write
+        taps = {} if folder is None else {j * per_group: logs[j][1] for j in range(len(opened))}
+        started_us = monotonic_us()
+        timing = fleet.run_realtime_fleet(
+            core, ports, taps, polled=lambda: ports.polled(lives), speed=speed, until_finished=until_finished,
+            stop=stop, say=report, progress=progress,
+        )  # fmt: skip
+        flown = tuple(
+            Flown(
+                vehicle.system_id, vehicle.succeeded,
+                "" if j * per_group not in taps else taps[j * per_group].wire.hexdigest(),
+                link=lives[j].statistics() if j < len(lives) else {},
+            )
+            for j, vehicle in enumerate(core.vehicles)
+        )  # fmt: skip
+        return _fleet_outcome(core, timing.simulated_us, monotonic_us() - started_us, flown, timing=timing)
+
+
+def _close_all(links: list[Link]) -> None:
+    for link in links:
+        link.close()
+
+
+def _flight_time_of(vehicle: Any) -> Callable[[], float]:
+    return lambda: float(vehicle.flight_time_s)
+
+
+def _channels_of(live: _LiveLinks) -> Callable[[], dict[str, Channels]]:
+    return lambda: live.channels
+
+
+class _Ports(Sequence[Link]):
+    """The links of a fleet, numbered through. Those of a vehicle are replaced where they become impaired."""
+
+    def __init__(self, groups: list[list[Link]]) -> None:
+        self._groups = groups
+        self._each = len(groups[0])
+        links = [link for group in groups for link in group]
+        self._changing = [port for port, link in enumerate(links) if not isinstance(link, UdpLink)]
+
+    def __len__(self) -> int:
+        return len(self._groups) * self._each
+
+    def __getitem__(self, port: Any) -> Any:
+        group, own = divmod(port, self._each)
+        if group >= len(self._groups):
+            raise IndexError(port)
+        return self._groups[group][own]
+
+    def polled(self, lives: Sequence[_LiveLinks]) -> list[int]:
+        """Ports with messages that are held back, and those whose sockets come and go."""
+        found = list(self._changing)
+        for number, live in enumerate(lives):
+            if live.channels:
+                found += [
+                    number * self._each + own
+                    for own, place in enumerate(PLACES[: self._each])
+                    if place in live.channels
+                ]
+        return found
+
+
+def _check_exposed_fleet(links: VehicleLinks, report: Callable[[str], None]) -> None:
+    """As `_check_exposed`, before there are keys: many vehicles have none in common."""
+    _check_exposed(links, report, signed=False, lockstep=False)
+
+
+def ground_fleet(
+    flight: Flight, addresses: Sequence[Address], folder: Path | None, *,
+    count: int, first_system_id: int, wing: str | None,
+    report: Callable[[str], None], stop: Callable[[], bool],
+) -> FleetOutcome:  # fmt: skip
+    """`count` controllers on the wall clock, each on its endpoint or all on one. Raises as `ground_realtime`."""
+    opened: list[Link] = []
+    with ExitStack() as stack:
+        stack.callback(_close_all, opened)
+        for address in addresses:
+            option = "--link udpin:HOST:PORT or --instance I"
+            opened.append(open_link(address, port_option=option, host_option="--link udpin:HOST:PORT"))
+
+        def failed(error: LogError) -> None:
+            report(f"logging has ended: {error}")
+
+        folders = [_fleet_folder(folder, first_system_id - 1 + j) for j in range(count)]
+        logs = [stack.enter_context(_logs(each, "ground", flight, failed)) for each in folders]
+        core = _many(
+            wings.find(wings.GROUND_GROUP, wing), flight, [recorder for recorder, _ in logs], count=count,
+            report=report, vehicle_system_id=first_system_id, one_link=len(addresses) < count,
+        )  # fmt: skip
+        taps = {} if folder is None else {j: tap for j, (_, tap) in enumerate(logs)}
+        simulated_us, wall_us = fleet.run_realtime_formation(core, opened, taps, stop=stop, say=report)
+        return _fleet_outcome(core, simulated_us, wall_us, core.flown())
+
+
+def fleet_in_memory(
+    flight: Flight, folder: Path | None, *, count: int, report: Callable[[str], None], progress: Progress | None
+) -> FleetOutcome:
+    """A fleet and its controllers in this process, in lock-step.
+
+    Raises `ScenarioError` for links that are not perfect.
+    """
+    if flight.scenario.impaired:
+        raise ScenarioError(f"{flight.name}: link, chaos: a fleet in memory has perfect links; allowed: absent")
+    with ExitStack() as stack:
+        folders = [_fleet_folder(folder, j) for j in range(count)]
+        vehicle_logs = [stack.enter_context(_logs(each, "vehicle", flight)) for each in folders]
+        ground_logs = [stack.enter_context(_logs(each, "ground", flight)) for each in folders]
+        core = _many(
+            wings.find(wings.VEHICLE_GROUP), flight, [recorder for recorder, _ in vehicle_logs], count=count,
+            seed=flight.scenario.seed, lockstep=True,
+        )  # fmt: skip
+        recorders = [recorder for recorder, _ in ground_logs]
+        formation = _many(wings.find(wings.GROUND_GROUP), flight, recorders, count=count, report=report)
+        taps = [tap for _, tap in vehicle_logs]
+        for tap, (_, ground_tap) in zip(taps, ground_logs, strict=True):
+            tap.flush = _both(tap.flush, ground_tap.flush)
+        started_us = monotonic_us()
+        end_us = fleet.fly_in_memory(core, core.vehicles, formation, taps, progress=progress)
+        flown = tuple(
+            replace(each, wire_hash=tap.wire.hexdigest()) for each, tap in zip(formation.flown(), taps, strict=True)
+        )
+        return _fleet_outcome(core, end_us, monotonic_us() - started_us, flown)
+
+
+def _both(one: Callable[[], None] | None, other: Callable[[], None] | None) -> Callable[[], None]:
+    def flush() -> None:
+        for each in (one, other):
+            if each is not None:
+                each()
+
+    return flush
+
+
+def _fleet_outcome(
+    core: Any, simulated_us: int, wall_us: int, flown: tuple[Flown, ...], timing: RealTime | None = None
+) -> FleetOutcome:
+    counters = core.counters
+    return FleetOutcome(
+        simulated_s=simulated_us / 1e6,
+        wall_s=wall_us / 1e6,
+        finished=all(each.finished for each in flown),
+        frames=counters.frames,
+        rejected=counters.rejected,
+        dropped={name: count for name, count in asdict(counters).items() if count and name not in _KEPT},
+        vehicles=flown,
+        collisions=tuple(getattr(core, "collisions", ())),
+        lateness_us=None if timing is None else (timing.lateness.p50_us, timing.lateness.p99_us),
+        rebased=0 if timing is None else timing.rebased,
+        lost_s=0.0 if timing is None else timing.lost_us / 1e6,
+    )
 
 
 def is_loopback(host: str) -> bool:

@@ -6,11 +6,15 @@ wherever anybody was heard, none goes back where it came from or to a link on wh
 
 from __future__ import annotations
 
-from mavsitl.codec import Frame
+from collections.abc import Callable
+from functools import cache
+from struct import calcsize
+
+from mavsitl.codec import SIGNATURE_BYTES, Frame
 from mavsitl.dialect import mavlink
 from mavsitl.services.base import Peer
 
-__all__ = ["MAX_PEERS", "NOT_FORWARDED", "TIMEOUT_US", "Router"]
+__all__ = ["MAX_PEERS", "NOBODY", "NOT_FORWARDED", "TIMEOUT_US", "Router", "by_sender", "by_target"]
 
 MAX_PEERS = 32
 """Components known per port; above it newcomers are not learned until one of the known falls silent."""
@@ -20,6 +24,9 @@ TIMEOUT_US = 15_000_000
 
 NOT_FORWARDED = frozenset((mavlink.MAVLINK_MSG_ID_SETUP_SIGNING, mavlink.MAVLINK_MSG_ID_RADIO_STATUS))
 """SETUP_SIGNING carries a key, and RADIO_STATUS tells of the one link it is heard on."""
+
+NOBODY = -1
+"""Whose a piece of a datagram is that is no frame."""
 
 _NOWHERE: tuple[int, ...] = ()
 
@@ -70,3 +77,77 @@ class Router:
             ):
                 found.append(other)
         return tuple(found)
+
+
+def by_target(datagram: bytes) -> list[tuple[int, bytes]]:
+    """The pieces of a datagram by the system they are for, 0 being everybody; frames are found, not checked.
+
+    What is no frame, and all that is after it, is one piece for `NOBODY`.
+    """
+    return _pieces(datagram, _target)
+
+
+def by_sender(datagram: bytes) -> list[tuple[int, bytes]]:
+    """The same by the system that sent them."""
+    return _pieces(datagram, _sender)
+
+
+def _pieces(datagram: bytes, whose: Callable[[bytes, int], int]) -> list[tuple[int, bytes]]:
+    found: list[tuple[int, int, int]] = []
+    begin, end = 0, len(datagram)
+    while begin < end:
+        stop = begin + _frame_bytes(datagram, begin)
+        owner = NOBODY
+        if begin < stop <= end:
+            owner = whose(datagram, begin)
+        else:
+            stop = end
+        if found and found[-1][0] == owner:
+            found[-1] = (owner, found[-1][1], stop)
+        else:
+            found.append((owner, begin, stop))
+        begin = stop
+    if len(found) == 1:
+        return [(found[0][0], datagram)]
+    return [(owner, datagram[first:last]) for owner, first, last in found]
+
+
+def _frame_bytes(datagram: bytes, begin: int) -> int:
+    """Length of the frame that begins there; 0: none does."""
+    if len(datagram) - begin < 8:
+        return 0
+    if datagram[begin] == _V2:
+        return 12 + datagram[begin + 1] + (SIGNATURE_BYTES if datagram[begin + 2] & 1 else 0)
+    return 8 + datagram[begin + 1] if datagram[begin] == _V1 else 0
+
+
+_V1, _V2 = 0xFE, 0xFD
+
+
+def _sender(datagram: bytes, begin: int) -> int:
+    return datagram[begin + (5 if datagram[begin] == _V2 else 3)]
+
+
+def _target(datagram: bytes, begin: int) -> int:
+    if datagram[begin] == _V2:
+        body, message_id = begin + 10, int.from_bytes(datagram[begin + 7 : begin + 10], "little")
+    else:
+        body, message_id = begin + 6, datagram[begin + 5]
+    offset = _target_offset(message_id)
+    # zeros at the end of a payload are not sent
+    return 0 if offset is None or offset >= datagram[begin + 1] else datagram[body + offset]
+
+
+@cache
+def _target_offset(message_id: int) -> int | None:
+    """Of `target_system` in the payload; None: the message has none, or is not known."""
+    message_class = mavlink.mavlink_map.get(message_id)
+    if message_class is None or "target_system" not in message_class.ordered_fieldnames:
+        return None
+    formats = bytes(message_class.native_format).decode().lstrip("<")
+    offset = 0
+    for name, kind, length in zip(message_class.ordered_fieldnames, formats, message_class.array_lengths, strict=True):
+        if name == "target_system":
+            return offset
+        offset += calcsize(f"<{kind}") * max(length, 1)
+    raise AssertionError("it is among the names")

@@ -330,6 +330,24 @@ class ParameterChange(Section, frozen=True):
     """Of `at_s`: since the release or the lift-off, or since the vehicle's start."""
 
 
+class Fleet(Section, frozen=True):
+    """Of a run with `--count`: vehicle 0 starts where the scenario says, the others where the formation has them."""
+
+    formation: Literal["grid", "line", "circle"] = "grid"
+    """A square filled row by row, eastward, then southward; a line to the east; a circle with vehicle 0 in the north.
+    References are shifted alike."""
+    spacing_m: Positive = 3.0
+    """Between neighbours."""
+    shared_wind: bool = False
+    """True: one turbulence that is everywhere the same; false: each vehicle has its own."""
+    collision_m: NonNegative = 0.5
+    """Two vehicles nearer than this have collided; 0: they are not looked at."""
+    collision_hz: Annotated[int, msgspec.Meta(ge=1, le=50)] = 20
+    """How often they are looked at."""
+    on_collision: Literal["report", "crash"] = "report"
+    """What it does: it is said to both and logged; or all rotors of both fail as well."""
+
+
 class Hover(Section, frozen=True, tag_field="kind", tag="hover"):
     position_nwu_m: Vector3 = (0.0, 0.0, 1.0)
     yaw_deg: float = 0.0
@@ -466,6 +484,7 @@ class Scenario(Section, frozen=True):
     """PX4 parameters of the vehicle, over the airframe's."""
     controller: Controller = Controller()
     reference: Reference = Hover()
+    fleet: Fleet = Fleet()
 
     @property
     def impaired(self) -> bool:
@@ -718,6 +737,12 @@ def _check(scenario: Scenario, where: str) -> None:
     if controller.inner == "pidnn" and controller.level != "attitude":
         raise ScenarioError(
             f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'"
+        )
+    fleet = scenario.fleet
+    if fleet.collision_m >= fleet.spacing_m:
+        raise ScenarioError(
+            f"{where}: fleet.collision_m: {fleet.collision_m:g} is not allowed; "
+            f"allowed: less than fleet.spacing_m ({fleet.spacing_m:g})"
         )
     _check_estimator(scenario, where)
     _check_link(scenario.link, f"{where}: link")

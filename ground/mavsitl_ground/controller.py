@@ -59,14 +59,17 @@ class Controller:
     No message, no clock but the vehicle's stamp.
     """
 
-    def __init__(self, flight: Flight) -> None:
-        """Raises `ScenarioError` where the airframe does not say what the command level needs."""
+    def __init__(self, flight: Flight, offset_nwu_m: Vector = (0.0, 0.0, 0.0)) -> None:
+        """`offset_nwu_m` moves the reference.
+
+        Raises `ScenarioError` where the airframe does not say what the command level needs.
+        """
         scenario, airframe = flight.scenario, flight.airframe
         settings = scenario.controller
         self._airframe = airframe
         self._settings = settings
         self._period_s = scenario.rates.control_period_us / 1e6
-        self._reference = reference_for(scenario.reference)
+        self._reference = reference_for(scenario.reference, offset_nwu_m)
         self._outer = PositionLoop(
             settings.altitude, settings.position, airframe.mass_kg, airframe.gravity_m_s2,
             radians(settings.tilt_limit_deg), airframe.max_thrust_n, self._period_s,
@@ -233,15 +236,19 @@ class Ground:
         *,
         report: Callable[[str], None] = lambda text: None,
         vehicle_system_id: int | None = None,
+        offset_nwu_m: Vector = (0.0, 0.0, 0.0),
     ) -> None:
-        """`report` gets a line at each step of the handshake and each STATUSTEXT of the vehicle."""
+        """`report` gets a line at each step of the handshake and each STATUSTEXT of the vehicle.
+
+        `offset_nwu_m`: the vehicle's place in a formation, by which the reference is moved.
+        """
         scenario = flight.scenario
         self.period_us = scenario.rates.control_period_us
         self._scenario = scenario
         self._level = scenario.controller.level
         self._node = Node(SYSTEM_ID, COMPONENT_ID)
         self._observer = Observer(scenario.controller.telemetry)
-        self._controller = Controller(flight)
+        self._controller = Controller(flight, offset_nwu_m)
         self._report = report
         self._texts = Joiner()
         messages = [(message_id, self.period_us) for message_id in STATE_MESSAGES[scenario.controller.telemetry]]
@@ -290,6 +297,22 @@ class Ground:
     def flight_time_s(self) -> float:
         """By the vehicle's clock since the release; negative before it."""
         return -1.0 if self._released_us is None else (self._observer.stamp_us - self._released_us) / 1e6
+
+    @property
+    def in_control(self) -> bool:
+        """The vehicle flies and follows."""
+        return self._handshake.in_control
+
+    @property
+    def position_nwu_m(self) -> Vector:
+        """Of the vehicle, as last told."""
+        x, y, z = self._observer.position_nwu_m[:, 0].tolist()
+        return x, y, z
+
+    @property
+    def reference_nwu_m(self) -> Vector:
+        """Where it was to be when it was last controlled."""
+        return self._controller.reference[0]
 
     @property
     def vehicle_time_us(self) -> int:
@@ -474,6 +497,13 @@ def _attitude_setpoint(values: Array) -> Array:
     return np.column_stack((*flip_euler(*values[:, _DESIRED].T), zero, zero, -values[:, _THRUST]))
 
 
-def build(flight: Flight, recorder: Recorder, **options: Any) -> Ground:
-    """The entry point `mavsitl.ground`: a ground core for the bridge's drivers."""
-    return Ground(flight, recorder, **options)
+def build(flight: Flight, recorder: Any, *, count: int | None = None, **options: Any) -> Any:
+    """The entry point `mavsitl.ground`: a ground core for the bridge's drivers; with `count` a `Formation`.
+
+    `recorder` is one of these, for a formation as many.
+    """
+    if count is None:
+        return Ground(flight, recorder, **options)
+    from mavsitl_ground.formation import Formation  # here, for it is made of grounds
+
+    return Formation(flight, recorder, count=count, **options)

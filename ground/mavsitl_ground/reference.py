@@ -35,6 +35,19 @@ class HoldPath:
         return self._sample
 
 
+class ShiftedPath:
+    """Another path, moved to a place of a formation."""
+
+    def __init__(self, path: Path3, offset_nwu_m: Vector3) -> None:
+        self._path = path
+        self._offset = offset_nwu_m
+
+    def sample(self, time_s: float) -> Sample:
+        (x, y, z), velocity, acceleration, yaw = self._path.sample(time_s)
+        dx, dy, dz = self._offset
+        return (x + dx, y + dy, z + dz), velocity, acceleration, yaw
+
+
 class SpiralPath:
     """Section 5.2: X_d = [r sin(w t), r cos(w t), v t], with its derivatives; yaw 0."""
 
@@ -193,8 +206,16 @@ def read_waypoints(file: str) -> list[tuple[float, float, float, float, float]]:
     return rows
 
 
-def reference_for(reference: Reference) -> Path3:
-    """The path that a scenario's reference describes. Raises `ScenarioError` for a waypoint file that is not one."""
+def reference_for(reference: Reference, offset_nwu_m: Vector3 = STILL) -> Path3:
+    """The path that a scenario's reference describes, moved by `offset_nwu_m` in metres.
+
+    Raises `ScenarioError` for a waypoint file that is not one.
+    """
+    path = _path(reference)
+    return path if offset_nwu_m == STILL else ShiftedPath(path, offset_nwu_m)
+
+
+def _path(reference: Reference) -> Path3:
     if isinstance(reference, Hover):
         return HoldPath(reference.position_nwu_m, radians(reference.yaw_deg))
     if isinstance(reference, Spiral):

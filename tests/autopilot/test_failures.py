@@ -81,7 +81,7 @@ class Rotors:
 
     @property
     def commanded(self) -> Any:
-        return self.simulation.motors.commanded_rad_s
+        return self.simulation.motors[0].commanded_rad_s
 
 
 def motor_off(rotors: Rotors) -> None:
@@ -128,7 +128,7 @@ def motor_garbage(rotors: Rotors) -> None:
     held = round(GARBAGE_S * 250)
     assert set(np.diff(np.flatnonzero(np.diff(speeds)))) <= {held, held + 1}
     assert 1000 // (held + 1) <= len(np.unique(speeds)) <= 1000 // held
-    largest = float(rotors.simulation.gains[26])
+    largest = float(rotors.simulation.gains[26, 0])
     assert 0.0 <= speeds.min() < 0.2 * largest
     assert 0.8 * largest < speeds.max() <= largest
 

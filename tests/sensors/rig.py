@@ -39,7 +39,7 @@ class Rig:
         self.failures = Failures()
         self.parameters = Parameters(frame.parameters, flight.scenario.parameters)
         self.simulation = Simulation(flight, self.parameters, seed, n, self.failures)
-        self.parameters.subscribe(lambda name, value: self.simulation.set_parameter(name))
+        self.parameters.subscribe(lambda name, value: self.simulation.set_parameter(0, name))
         self.control = PositionControl(
             VALUES | GAINS["paper"], frame.gravity_m_s2, 1.0 / frame.thrust_to_weight, PERIOD_S
         )

@@ -65,7 +65,7 @@ def test_it_does_not_begin_while_the_gyro_says_that_it_turns() -> None:
 
 def test_begun_anew_elsewhere_gps_and_barometer_tell_where() -> None:
     rig = up()
-    rig.simulation.put_back()
+    rig.simulation.put_back(0)
     rig.rest(1.0)
     assert np.abs(rig.position_error).max() < 0.03
     rig.simulation.x[:3, 0] += (7.0, -4.0, 2.0)

@@ -80,11 +80,11 @@ class Mishaps:
         if stall_s and not self.stalled:
             self.stalled = True
             self._stalled_us = now_us - period_us
-            vehicle.simulation.stall(True)
+            vehicle.simulation.stall(vehicle.column, True)
         lasts_us = now_us - period_us - self._stalled_us
         if self.stalled and lasts_us >= stall_s * 1e6 - 0.5:
             self.stalled = False
-            vehicle.simulation.stall(False)
+            vehicle.simulation.stall(vehicle.column, False)
             self._parameters.put("SIM_CPU_STALL", 0)
             vehicle.note(f"Autopilot stalled for {lasts_us / 1e6:g} s")
         self.busy = self.stalled or bool(self._parameters["SIM_GUST_TRIG"])
@@ -136,11 +136,12 @@ class Mishaps:
     def _blow(self, start: bool) -> None:
         vehicle, p = self._vehicle, self._parameters
         if not start:
-            vehicle.simulation.blow(None)
+            vehicle.simulation.blow(vehicle.column, None)
             return
         x, y, z = (p["SIM_GUST_SPD"] * mil_axes(p["SIM_GUST_DIR"])[0]).tolist()
         start_s, length_s = vehicle.flight_time_s, p["SIM_GUST_LEN"]
-        vehicle.simulation.blow(Gust(velocity_nwu_m_s=(x, y, z), start_s=start_s, length_s=length_s))
+        gust = Gust(velocity_nwu_m_s=(x, y, z), start_s=start_s, length_s=length_s)
+        vehicle.simulation.blow(vehicle.column, gust)
         self._gust_ends_s = start_s + 2.0 * length_s
         self.busy = True
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from math import exp, inf, nan, sqrt
 
-import numpy as np
-
 from mavsitl import seeds
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.failures import Change, Failures, Kind, Unit
@@ -18,21 +16,23 @@ GARBAGE_S = 0.1
 
 
 class MotorFailures:
-    """Of vehicle 0; the other columns of `rows` (MOTOR_ROWS, n) follow their commands."""
+    """Of one vehicle."""
 
-    def __init__(self, failures: Failures, seed: int, step_s: float, gains: tick.Array, n: int) -> None:
-        """`step_s`: of the physics."""
-        self.rows = np.zeros((tick.MOTOR_ROWS, n))
-        self.rows[tick.SPEED_SHARE : tick.SPEED_SHARE + MOTORS] = 1.0
-        self.rows[tick.FIXED_SPEED : tick.FIXED_SPEED + MOTORS] = nan
-        self.rows[tick.FOLLOW : tick.FOLLOW + MOTORS] = 1.0
+    def __init__(
+        self, failures: Failures, seed: int, step_s: float, largest_rad_s: float, rows: tick.Array, vehicle: int
+    ) -> None:
+        """`step_s`: of the physics; `rows` (MOTOR_ROWS,): its column; `vehicle`: its number in the fleet."""
+        self._rows = rows
+        rows[tick.SPEED_SHARE : tick.SPEED_SHARE + MOTORS] = 1.0
+        rows[tick.FIXED_SPEED : tick.FIXED_SPEED + MOTORS] = nan
+        rows[tick.FOLLOW : tick.FOLLOW + MOTORS] = 1.0
         self.busy = False
         """`step` is needed before the next period."""
         self._failures = failures
         self._step_s = step_s
-        self._largest = float(gains[tick.MAX_ROTOR_SPEED])
+        self._largest = largest_rad_s
         self._generators = [
-            seeds.generator(seed, "vehicle", 0, "failures", "motor", motor) for motor in range(1, MOTORS + 1)
+            seeds.generator(seed, "vehicle", vehicle, "failures", "motor", motor) for motor in range(1, MOTORS + 1)
         ]
         self._kinds = [Kind.OK] * MOTORS
         self._changes_at_s = [-inf] * MOTORS
@@ -45,8 +45,8 @@ class MotorFailures:
 
     @property
     def commanded_rad_s(self) -> tick.Array:
-        """(4,) what the allocation asked of vehicle 0's rotors."""
-        commanded: tick.Array = self.rows[tick.COMMANDED : tick.COMMANDED + MOTORS, 0]
+        """(4,) what the allocation asked of the rotors."""
+        commanded: tick.Array = self._rows[tick.COMMANDED : tick.COMMANDED + MOTORS]
         return commanded
 
     def hold(self, command_rad_s: tick.Array | None) -> None:
@@ -80,9 +80,9 @@ class MotorFailures:
                 self.busy = True
             if self._held is not None:
                 fixed = float(self._held[index])
-            self.rows[tick.SPEED_SHARE + index, 0] = share
-            self.rows[tick.FIXED_SPEED + index, 0] = fixed
-            self.rows[tick.FOLLOW + index, 0] = follow
+            self._rows[tick.SPEED_SHARE + index] = share
+            self._rows[tick.FIXED_SPEED + index] = fixed
+            self._rows[tick.FOLLOW + index] = follow
 
     def _go_on(self, index: int, kind: Kind, time_s: float, began: bool) -> None:
         """What a motor that goes its own ways does next, and for how long."""

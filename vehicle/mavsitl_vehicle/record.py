@@ -80,13 +80,13 @@ class Record:
         self._recorder.message(now_us, severity, text)
 
     def write(self, now_us: int, vehicle: Vehicle) -> None:
-        simulation, autopilot = vehicle.simulation, vehicle.autopilot
+        simulation, autopilot, j = vehicle.simulation, vehicle.autopilot, vehicle.column
         row = self._block.row(now_us)
-        row[_TRUTH] = simulation.x[:, 0]
-        row[_ESTIMATE] = simulation.estimate[:, 0]
-        row[_WIND] = simulation.wind[:, 0]
-        row[_INNER] = simulation.inner[tick.RATE_SETPOINT : tick.SATURATED + 1, 0]
-        row[_THRUST] = simulation.demand[tick.THRUST, 0]
+        row[_TRUTH] = simulation.x[:, j]
+        row[_ESTIMATE] = simulation.estimate[:, j]
+        row[_WIND] = simulation.wind[:, j]
+        row[_INNER] = simulation.inner[tick.RATE_SETPOINT : tick.SATURATED + 1, j]
+        row[_THRUST] = simulation.demand[tick.THRUST, j]
         if self._sensors is not None and simulation.sensed is not None:
             self._sensors.write(now_us, simulation.sensed, autopilot.health)
         if self._weights is not None and vehicle.weights is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from math import nan, radians
 
 import msgspec
@@ -36,25 +37,47 @@ WARM_UP_US = 1_000_000
 class Simulation:
     """Arrays have the fleet axis last: `x` (17, n) the truth, `estimate` (13, n) what sensors say, `wind` (3, n).
 
+    What is per vehicle takes its column `j`. Columns are independent: a vehicle's parameters, failures and random
+    numbers change nothing of another's.
+
     Attributes:
         sensed: sensors and filter; None: the estimate is the truth with white noise.
+        held: (n,) in the clamp.
         at_rest: (n,) the vehicle knows that it does not move: on the ground, or in the clamp.
     """
 
     def __init__(
-        self, flight: Flight, parameters: Parameters, seed: int, n: int = 1, failures: Failures | None = None
+        self,
+        flight: Flight,
+        parameters: Parameters | Sequence[Parameters],
+        seed: int,
+        n: int = 1,
+        failures: Failures | Sequence[Failures] | None = None,
+        *,
+        first: int = 0,
+        positions_nwu_m: Sequence[Vector] | None = None,
+        shared_wind: bool = False,
     ) -> None:
-        """`failures` break the sensors of all `n` vehicles, and vehicle 0's motors; None: nothing is broken."""
+        """`parameters` and `failures` are one for all `n` vehicles or each one's own; None: nothing is broken.
+
+        The columns are the vehicles `first` and after it of the fleet, by which random numbers are drawn.
+        `positions_nwu_m` are where they start, None: all at the scenario's start. With `shared_wind` the scenario's
+        turbulence is the same for all. Raises `ValueError` for sensors of vehicles that have parameters of their own:
+        these take a simulation each.
+        """
         scenario = flight.scenario
         self.n = n
         self._flight = flight
-        self._parameters = parameters
+        self._parameters = [parameters] * n if isinstance(parameters, Parameters) else list(parameters)
+        if failures is None or isinstance(failures, Failures):
+            failures = [Failures() if failures is None else failures] * n
+        vehicles = range(first, first + n)
         self.substeps = scenario.rates.substeps
         self.dt_s = 1.0 / scenario.rates.physics_hz
         self._start = initial_state(scenario.start.position_nwu_m, radians(scenario.start.yaw_deg), 0.0, n)
+        if positions_nwu_m is not None:
+            self._start[0:3] = np.array(positions_nwu_m).T
         self.x = self._start.copy()
-        self.plant = self._plant()
-        self.field = WindField(scenario.wind, n, self.dt_s)
         self.wind = np.zeros((3, n))
         self.estimate = np.zeros((tick.ESTIMATE_ROWS, n))
         self.demand = np.zeros((tick.DEMAND_ROWS, n))
@@ -62,32 +85,50 @@ class Simulation:
         self.inner = np.zeros((tick.INNER_ROWS, n))
         self.held = np.full(n, scenario.start.clamp)
         self.at_rest = np.ones(n, dtype=np.bool_)
-        self.gains = _gains(flight, parameters)
-        self.sigma = self._sigma()
+        self.plant = np.hstack([self._plant(j) for j in range(n)])
+        self.gains = np.stack([_gains(flight, each) for each in self._parameters], axis=-1)
+        self.sigma = np.stack([self._sigma(j) for j in range(n)], axis=-1)
+        self._flight_time_s = np.zeros(n)
         self._velocity = self.x[3:6].copy()
         """At the beginning of the tick."""
         self._command = np.zeros((4, n))
-        self.motors = MotorFailures(Failures() if failures is None else failures, seed, self.dt_s, self.gains, n)
-        self._gust: Gust | None = None
-        self._stalled_inner: tick.Array | None = None
-        self._wind_generators = [seeds.generator(seed, "vehicle", j, "wind") for j in range(n)]
-        self._sensor_generators = [seeds.generator(seed, "vehicle", j, "sensors") for j in range(n)]
+        self._motor_rows = np.zeros((tick.MOTOR_ROWS, n))
+        largest = flight.airframe.max_rotor_speed_rad_s
+        self.motors = [
+            MotorFailures(failures[j], seed, self.dt_s, largest, self._motor_rows[:, j], vehicle)
+            for j, vehicle in enumerate(vehicles)
+        ]
+        self._gusts: dict[int, Gust] = {}
+        self._stalled_inner: dict[int, tick.Array] = {}
+        self._wind_generators = [seeds.generator(seed, "vehicle", j, "wind") for j in vehicles]
+        self._sensor_generators = [seeds.generator(seed, "vehicle", j, "sensors") for j in vehicles]
+        self._shared_wind = seeds.generator(seed, "fleet", "wind") if shared_wind else None
+        self.field = WindField(scenario.wind, n, self.dt_s)
         per_reset = self.field.normals_for_reset
-        self.field.reset(np.stack([g.standard_normal(per_reset) for g in self._wind_generators], axis=-1))
+        if self._shared_wind is None:
+            normals = np.stack([g.standard_normal(per_reset) for g in self._wind_generators], axis=-1)
+        else:
+            normals = np.repeat(self._shared_wind.standard_normal(per_reset)[:, None], n, axis=1)
+        self.field.reset(normals)
         self._tick = 0
         self._scenario_rows = self.field.normals_per_step
-        if winds := self._parameter_winds():
-            self._set_winds(winds)
-        self._sensor_block = np.zeros((0, 0, n))
-        self._wind_block = np.zeros((0, 0, n))
+        self._own_winds: dict[int, tuple[Wind, ...]] = {}
+        for j in range(n):
+            if winds := self._parameter_winds(j):
+                self._set_winds(j, winds)
         self.sensed: SensedEstimator | None = None
         self._white = known(scenario.noise)
         if has_sensors(scenario):
-            self.sensed = self._make_sensed(seed, failures or Failures())
+            if any(each is not self._parameters[0] for each in self._parameters):
+                raise ValueError("sensors of vehicles with parameters of their own: these take a simulation each")
+            self.sensed = self._make_sensed(seed, failures[0], vehicles)
             self.sensed.present(self.estimate)
-        self._draw()
+        self._wind_normals = _Normals(self._draw_wind, n, n + shared_wind)
+        self._sensor_normals = _Normals(self._draw_sensors, n, n)
+        self._size_normals()
         if self.sensed is None:
-            self._measure()
+            for j in range(n):
+                self._measure(j)
         self._warm_up()
 
     def set_demand(self, j: int, setpoint: Setpoint | None) -> None:
@@ -111,17 +152,17 @@ class Simulation:
 
     @property
     def estimator_status(self) -> EstimatorStatus:
-        """Vehicle 0's."""
+        """Of sensors, the first column's."""
         return self._white if self.sensed is None else self.sensed.status
 
     @property
     def readings(self) -> Readings | None:
-        """Vehicle 0's; None: there are no sensors."""
+        """The first column's; None: there are no sensors."""
         return None if self.sensed is None else self.sensed.readings()
 
-    def put_back(self) -> None:
+    def put_back(self, j: int) -> None:
         """At rest at the start pose, rotors still; time, wind and sensors go on, a filter begins anew."""
-        self.x[:] = self._start
+        self.x[:, j] = self._start[:, j]
         if self.sensed is not None:
             self.sensed.restart(at_start=True)
 
@@ -130,33 +171,34 @@ class Simulation:
         if self.sensed is not None:
             self.sensed.restart(at_start=False)
 
-    def set_upright(self) -> None:
+    def set_upright(self, j: int) -> None:
         """Level and at rest where it lies, with the heading it has, rotors still."""
-        for j in range(self.n):
-            w, x, y, z = self.x[6:10, j].tolist()
-            yaw_rad = to_euler((w, x, y, z))[2]
-            here: Vector = tuple(self.x[0:3, j].tolist())
-            self.x[:, j] = initial_state(here, yaw_rad, 0.0, 1)[:, 0]
+        w, x, y, z = self.x[6:10, j].tolist()
+        yaw_rad = to_euler((w, x, y, z))[2]
+        here: Vector = tuple(self.x[0:3, j].tolist())
+        self.x[:, j] = initial_state(here, yaw_rad, 0.0, 1)[:, 0]
         if self.sensed is None:
-            self._measure()
+            self._measure(j)
 
-    def set_parameter(self, name: str) -> None:
-        """Take up a parameter that was changed in flight; those that are none of the simulation's change nothing."""
+    def set_parameter(self, j: int, name: str) -> None:
+        """Take up one of `j`'s that was changed in flight; those that are none of the simulation's change nothing."""
         if name.startswith("MC_"):
-            self.gains = _gains(self._flight, self._parameters)
+            self.gains[:, j] = _gains(self._flight, self._parameters[j])
         elif name == "SIM_NOISE_SCALE":
-            self.sigma = self._sigma()
-            self.gains = _gains(self._flight, self._parameters)
+            self.sigma[:, j] = self._sigma(j)
+            self.gains[:, j] = _gains(self._flight, self._parameters[j])
             if self.sensed is not None:
                 self.sensed.set_noise()
         elif name.startswith(("SIM_GYR_", "SIM_ACC_")):
             if self.sensed is not None:
                 self.sensed.set_noise()
         elif name == "SIM_MASS_SCALE":
-            self.plant = self._plant()
+            self.plant[:, j] = self._plant(j)[:, 0]
         elif name.startswith("SIM_WIND_"):
-            self._set_winds(self._parameter_winds())
-            self._draw()
+            self._set_winds(j, self._parameter_winds(j))
+            self._size_normals()
+            self._wind_normals.redraw(j)
+            self._sensor_normals.redraw(j)
 
     def specific_force(self, j: int) -> Vector:
         """What an accelerometer at the centre measures, mean over the last tick, m/s^2 FLU: (0, 0, g) at rest."""
@@ -165,21 +207,22 @@ class Simulation:
         w, x, y, z = self.x[6:10, j].tolist()
         return rotate(conjugate((w, x, y, z)), (ax, ay, az + self._flight.airframe.gravity_m_s2))
 
-    def _plant(self) -> tick.Array:
+    def _plant(self, j: int) -> tick.Array:
+        """(N_PARAMETERS, 1)"""
         scenario = self._flight.scenario
         offnominal = scenario.offnominal
-        scale = offnominal.mass_scale * self._parameters["SIM_MASS_SCALE"]
+        scale = offnominal.mass_scale * self._parameters[j]["SIM_MASS_SCALE"]
         offnominal = msgspec.structs.replace(offnominal, mass_scale=scale)
-        return plant_parameters(self._flight.airframe, offnominal, scenario.ground_contact, self.n)
+        return plant_parameters(self._flight.airframe, offnominal, scenario.ground_contact, 1)
 
-    def _sigma(self) -> tick.Array:
+    def _sigma(self, j: int) -> tick.Array:
         noise = self._flight.scenario.noise
         sigma = [noise.position_m, noise.velocity_m_s, radians(noise.attitude_deg), radians(noise.rate_deg_s)]
-        return np.array(sigma) * self._parameters["SIM_NOISE_SCALE"]
+        return np.array(sigma) * self._parameters[j]["SIM_NOISE_SCALE"]
 
-    def _parameter_winds(self) -> tuple[Wind, ...]:
+    def _parameter_winds(self, j: int) -> tuple[Wind, ...]:
         """SIM_WIND_*: a mean wind, and turbulence, on top of the scenario's."""
-        p = self._parameters
+        p = self._parameters[j]
         from_deg = p["SIM_WIND_DIR"]
         winds: list[Wind] = []
         if p["SIM_WIND_SPD"] > 0.0:
@@ -191,83 +234,97 @@ class Simulation:
             )
         return tuple(winds)
 
-    def _set_winds(self, added: tuple[Wind, ...]) -> None:
-        """The scenario's winds, whose turbulence goes on, and `added`, whose turbulence begins stationary."""
-        extra = WindField(added, self.n, self.dt_s)
-        rows = extra.normals_for_reset
-        extra.reset(np.stack([g.standard_normal(rows) for g in self._wind_generators], axis=-1))
-        field = WindField(self._flight.scenario.wind + added, self.n, self.dt_s)
-        kept = self._scenario_rows
-        field.state[:kept] = self.field.state[:kept]
-        field.state[kept:] = extra.state
+    def _set_winds(self, j: int, own: tuple[Wind, ...]) -> None:
+        """What blows on `j` alone: its turbulence begins stationary; everything else goes on."""
+        begun = WindField(own, 1, self.dt_s)
+        begun.reset(self._wind_generators[j].standard_normal(begun.normals_for_reset)[:, None])
+        self._own_winds[j] = own
+        before, field = self.field, WindField(self._flight.scenario.wind, self.n, self.dt_s, self._own_winds)
+        kept = min(before.normals_per_step, field.normals_per_step)
+        field.state[:kept] = before.state[:kept]
+        field.state[self._scenario_rows : self._scenario_rows + len(begun.state), j] = begun.state[:, 0]
         self.field = field
-        if self._gust is not None:
-            field.add(self._gust)
+        for vehicle, gust in self._gusts.items():
+            field.blow(vehicle, gust)
 
-    def blow(self, gust: Gust | None) -> None:
-        """A gust on top of everything else, in place of the one before; None: it is over."""
-        if self._gust is not None:
-            self.field.drop_last()
-        self._gust = gust
+    def blow(self, j: int, gust: Gust | None) -> None:
+        """A gust on `j`, on top of everything else, in place of the one before; None: it is over."""
+        self._gusts.pop(j, None)
         if gust is not None:
-            self.field.add(gust)
+            self._gusts[j] = gust
+        self.field.blow(j, gust)
 
-    def stall(self, stalled: bool) -> None:
+    def stall(self, j: int, stalled: bool) -> None:
         """The inner loops stand still: the rotors keep what they were commanded last."""
         if stalled:
-            self._stalled_inner = self.inner.copy()
-            self.motors.hold(self._command[:, 0])
-        elif self._stalled_inner is not None:
-            self.inner[:], self._stalled_inner = self._stalled_inner, None
-            self.motors.hold(None)
+            self._stalled_inner[j] = self.inner[:, j].copy()
+            self.motors[j].hold(self._command[:, j])
+        elif j in self._stalled_inner:
+            self.inner[:, j] = self._stalled_inner.pop(j)
+            self.motors[j].hold(None)
 
-    def advance(self, flight_time_s: float) -> None:
+    def advance(self, flight_time_s: float | tick.Array) -> None:
         """One control period: the inner loops and the physics at the physics rate, then the sensors.
 
-        `flight_time_s`: since the release, negative before it; gusts go by it.
+        `flight_time_s`, of all or (n,) each one's: since the release, negative before it; gusts go by it.
         """
         row = self._tick % BLOCK_TICKS
-        if row == 0 and self._tick:
-            self._draw()
+        if self._tick:
+            self._wind_normals.go_on(row)
+            self._sensor_normals.go_on(row)
         self._velocity[:] = self.x[3:6]
+        self._flight_time_s[:] = flight_time_s
         self._tick += 1
         field = self.field
-        if self.motors.busy:
-            self.motors.step((self._tick - 1) * self.substeps * self.dt_s, self.x[13:17, 0])
+        for j, motors in enumerate(self.motors):
+            if motors.busy:
+                motors.step((self._tick - 1) * self.substeps * self.dt_s, self.x[13:17, j])
         if self.sensed is not None:
-            self._advance_sensed(self.sensed, row, flight_time_s)
+            self._advance_sensed(self.sensed, row)
             return
         tick.advance(
-            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self.motors.rows,
-            self._command, field.state, field.coefficients, self.wind, self._wind_block[row], self._sensor_block[row],
-            self.sigma, flight_time_s, self.dt_s, self.substeps,
+            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._motor_rows,
+            self._command, field.state, field.coefficients, self.wind, self._wind_normals.block[row],
+            self._sensor_normals.block[row], self.sigma, self._flight_time_s, self.dt_s, self.substeps,
         )  # fmt: skip
 
-    def _advance_sensed(self, sensed: SensedEstimator, row: int, flight_time_s: float) -> None:
+    def _advance_sensed(self, sensed: SensedEstimator, row: int) -> None:
         field, unit = self.field, sensed.imu
         tick.advance_sensed(
-            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self.motors.rows,
-            self._command, field.state, field.coefficients, self.wind, self._wind_block[row], self._sensor_block[row],
+            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._motor_rows,
+            self._command, field.state, field.coefficients, self.wind, self._wind_normals.block[row],
+            self._sensor_normals.block[row],
             unit.state, unit.late, unit.settings, unit.added, *sensed.failure_kinds(),
-            flight_time_s, self.dt_s, self.substeps,
+            self._flight_time_s, self.dt_s, self.substeps,
         )  # fmt: skip
         sensed.update(self.x, self.at_rest, self.estimate)
 
-    def _make_sensed(self, seed: int, failures: Failures) -> SensedEstimator:
-        return SensedEstimator(self._flight, self._parameters, failures, seed, self.x, self.dt_s)
+    def _make_sensed(self, seed: int, failures: Failures, vehicles: Sequence[int]) -> SensedEstimator:
+        return SensedEstimator(self._flight, self._parameters[0], failures, seed, self.x, self.dt_s, vehicles)
 
-    def _draw(self) -> None:
-        wind_rows = self.substeps * self.field.normals_per_step
+    # --- random numbers ----------------------------------------------------------------------------------------------
+
+    def _size_normals(self) -> None:
+        self._wind_normals.size(self.substeps, self.field.normals_per_step)
         if self.sensed is None:
-            sensor_rows = self.substeps * tick.GYRO_NORMALS + tick.MEASURE_NORMALS
-            generators = self._sensor_generators
+            self._sensor_normals.size(1, self.substeps * tick.GYRO_NORMALS + tick.MEASURE_NORMALS)
         else:
-            sensor_rows = (self.substeps + 1) * imu.NORMALS
-            generators = self.sensed.imu.generators
-        self._wind_block = np.stack(
-            [g.standard_normal((BLOCK_TICKS, wind_rows)) for g in self._wind_generators], axis=-1
-        )
-        self._sensor_block = np.stack([g.standard_normal((BLOCK_TICKS, sensor_rows)) for g in generators], axis=-1)
+            self._sensor_normals.size(1, (self.substeps + 1) * imu.NORMALS)
+
+    def _draw_wind(self, j: int, steps: tick.Array) -> None:
+        """For each step those of the scenario's winds, then those of the vehicle's own; `j` = n is the shared wind."""
+        common = self._scenario_rows
+        if j == self.n:
+            assert self._shared_wind is not None
+            normals = self._shared_wind.standard_normal((*steps.shape[:2], common))
+            steps[:, :, :common] = normals[..., None]
+            return
+        begin, end = common if self._shared_wind else 0, common + self.field.own_normals[j]
+        steps[:, :, begin:end, j] = self._wind_generators[j].standard_normal((*steps.shape[:2], end - begin))
+
+    def _draw_sensors(self, j: int, steps: tick.Array) -> None:
+        generators = self._sensor_generators if self.sensed is None else self.sensed.imu.generators
+        steps[:, :, :, j] = generators[j].standard_normal(steps.shape[:3])
 
     def _warm_up(self) -> None:
         """Run each kernel once on copies, so that compiling, or reading the cache, is done before the clock runs."""
@@ -278,14 +335,15 @@ class Simulation:
         for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
             demand[tick.KIND] = kind
             tick.advance(
-                x, estimate, demand, self.gains, inner, self.held, self.plant, self.motors.rows.copy(),
+                x, estimate, demand, self.gains, inner, self.held, self.plant, self._motor_rows.copy(),
                 self._command.copy(),
                 self.field.state.copy(), self.field.coefficients, self.wind.copy(),
-                self._wind_block[0], self._sensor_block[0], self.sigma, 0.0, self.dt_s, self.substeps,
+                self._wind_normals.block[0], self._sensor_normals.block[0], self.sigma, self._flight_time_s, self.dt_s,
+                self.substeps,
             )  # fmt: skip
 
     def _warm_up_sensed(self, x: tick.Array, estimate: tick.Array, demand: tick.Array, inner: tick.Array) -> None:
-        sensed, field = self._make_sensed(0, Failures()), self.field
+        sensed, field = self._make_sensed(0, Failures(), range(self.n)), self.field
         unit, held = sensed.imu, np.ones(self.n, dtype=np.bool_)
         unit.added[:] = 0.0  # nothing that would keep it from beginning
         unit.state[imu.BIAS : imu.BIAS + 6] = 0.0
@@ -293,17 +351,78 @@ class Simulation:
             for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
                 demand[tick.KIND] = kind
                 tick.advance_sensed(
-                    x, estimate, demand, self.gains, inner, held, self.plant, self.motors.rows.copy(),
+                    x, estimate, demand, self.gains, inner, held, self.plant, self._motor_rows.copy(),
                     self._command.copy(),
-                    field.state.copy(), field.coefficients, self.wind.copy(), self._wind_block[0],
-                    self._sensor_block[0], unit.state, unit.late, unit.settings, unit.added, 0, 0,
-                    0.0, self.dt_s, self.substeps,
+                    field.state.copy(), field.coefficients, self.wind.copy(), self._wind_normals.block[0],
+                    self._sensor_normals.block[0], unit.state, unit.late, unit.settings, unit.added, 0, 0,
+                    self._flight_time_s, self.dt_s, self.substeps,
                 )  # fmt: skip
             sensed.update(x, held, estimate)
 
-    def _measure(self) -> None:
-        normals = np.stack([g.standard_normal(tick.MEASURE_NORMALS) for g in self._sensor_generators], axis=-1)
-        tick.measure(self.x, self.sigma, normals, self.estimate)
+    def _measure(self, j: int) -> None:
+        estimate = np.zeros((tick.ESTIMATE_ROWS, 1))
+        normals = self._sensor_generators[j].standard_normal(tick.MEASURE_NORMALS)[:, None]
+        tick.measure(self.x[:, j : j + 1].copy(), self.sigma[:, j : j + 1].copy(), normals, estimate)
+        self.estimate[:, j] = estimate[:, 0]
+
+
+class _Normals:
+    """Standard normals for `BLOCK_TICKS` at a time. The next block's are drawn vehicle by vehicle meanwhile, so that no
+    tick draws all of a fleet's.
+
+    Attributes:
+        block: (BLOCK_TICKS, rows, n), a row of it for each tick.
+    """
+
+    def __init__(self, draw: Callable[[int, tick.Array], None], n: int, count: int) -> None:
+        """`draw(each, steps)` fills what is `each`'s, of `count`, in steps (BLOCK_TICKS, steps a tick, rows, n)."""
+        self._draw = draw
+        self._n, self._count = n, count
+        self._due: dict[int, list[int]] = {}
+        """By tick of a block, who draws then: the first for this block, at its beginning, the others for the next."""
+        for each in range(count):
+            self._due.setdefault(BLOCK_TICKS * each // count, []).append(each)
+        self._now = self._next = np.zeros((0, 0, 0, n))
+        self._ahead: set[int] = set()
+        """Those that have drawn for the next block."""
+        self.block = np.zeros((0, 0, n))
+
+    def size(self, steps: int, rows: int) -> None:
+        """What is drawn already stays, unless there was nothing."""
+        before = self._now, self._next
+        if before[0].shape[1:3] == (steps, rows):
+            return
+        shape = (BLOCK_TICKS, steps, rows, self._n)
+        self._now, self._next = np.zeros(shape), np.zeros(shape)
+        if not before[0].shape[0]:
+            for each in range(self._count):
+                self._draw(each, self._now)
+        else:
+            kept = min(rows, before[0].shape[2])
+            for old, new in zip(before, (self._now, self._next), strict=True):
+                new[:, :, :kept] = old[:, :, :kept]
+        self._show()
+
+    def redraw(self, each: int) -> None:
+        """From now on other ones."""
+        self._draw(each, self._now)
+        if each in self._ahead:
+            self._draw(each, self._next)
+
+    def go_on(self, row: int) -> None:
+        """Before tick `row` of a block; not before the first of all."""
+        if row == 0:
+            self._now, self._next = self._next, self._now
+            self._ahead.clear()
+            self._show()
+        for each in self._due.get(row, ()):
+            if row:
+                self._ahead.add(each)
+            self._draw(each, self._next if row else self._now)
+
+    def _show(self) -> None:
+        ticks, steps, rows, n = self._now.shape
+        self.block = self._now.reshape(ticks, steps * rows, n)
 
 
 def _gains(flight: Flight, parameters: Parameters) -> tick.Array:

@@ -28,7 +28,7 @@ DEMAND_ROWS = 13
 
 STOPPED, TORQUE_KIND, RATE_KIND, ATTITUDE_KIND = 0.0, 1.0, 2.0, 3.0
 
-# Rows of `gains`, one column for all vehicles of one airframe (GAIN_ROWS,).
+# Rows of `gains`, each vehicle's own (GAIN_ROWS, n).
 ATTITUDE_P = 0  # 0:3
 RATE_P = 3  # 3:6
 RATE_I = 6  # 6:9
@@ -71,19 +71,19 @@ def rate_setpoint(demand: Array, estimate: Array, gains: Array, inner: Array, j:
     ex, ey, ez = attitude_error(
         estimate[6, j], estimate[7, j], estimate[8, j], estimate[9, j],
         demand[ATTITUDE, j], demand[ATTITUDE + 1, j], demand[ATTITUDE + 2, j], demand[ATTITUDE + 3, j],
-        gains[YAW_WEIGHT],
+        gains[YAW_WEIGHT, j],
     )  # fmt: skip
-    yaw_gain = gains[ATTITUDE_P + 2] / gains[YAW_WEIGHT] if gains[YAW_WEIGHT] > 1e-4 else 0.0
-    p, q, r = gains[ATTITUDE_P] * ex, gains[ATTITUDE_P + 1] * ey, yaw_gain * ez
+    yaw_gain = gains[ATTITUDE_P + 2, j] / gains[YAW_WEIGHT, j] if gains[YAW_WEIGHT, j] > 1e-4 else 0.0
+    p, q, r = gains[ATTITUDE_P, j] * ex, gains[ATTITUDE_P + 1, j] * ey, yaw_gain * ez
     feed = demand[YAW_RATE, j]
     if feed == feed:
         w, x, y, z = estimate[6, j], estimate[7, j], estimate[8, j], estimate[9, j]
         p += feed * 2.0 * (x * z - w * y)  # the world's z axis in body axes
         q += feed * 2.0 * (y * z + w * x)
         r += feed * (1.0 - 2.0 * (x * x + y * y))
-    inner[RATE_SETPOINT, j] = min(max(p, -gains[RATE_MAX]), gains[RATE_MAX])
-    inner[RATE_SETPOINT + 1, j] = min(max(q, -gains[RATE_MAX + 1]), gains[RATE_MAX + 1])
-    inner[RATE_SETPOINT + 2, j] = min(max(r, -gains[RATE_MAX + 2]), gains[RATE_MAX + 2])
+    inner[RATE_SETPOINT, j] = min(max(p, -gains[RATE_MAX, j]), gains[RATE_MAX, j])
+    inner[RATE_SETPOINT + 1, j] = min(max(q, -gains[RATE_MAX + 1, j]), gains[RATE_MAX + 1, j])
+    inner[RATE_SETPOINT + 2, j] = min(max(r, -gains[RATE_MAX + 2, j]), gains[RATE_MAX + 2, j])
 
 
 @compiled
@@ -115,9 +115,9 @@ def inner_loops(
                 inner[RATE_INTEGRAL + i, j] = 0.0
                 inner[LAST_GYRO + i, j] = gyro[i, j]
             torque = (
-                demand[TORQUE, j] * gains[MAX_TORQUE],
-                demand[TORQUE + 1, j] * gains[MAX_TORQUE + 1],
-                demand[TORQUE + 2, j] * gains[MAX_TORQUE + 2],
+                demand[TORQUE, j] * gains[MAX_TORQUE, j],
+                demand[TORQUE + 1, j] * gains[MAX_TORQUE + 1, j],
+                demand[TORQUE + 2, j] * gains[MAX_TORQUE + 2, j],
             )
         else:
             share = (0.0, 0.0, 0.0)
@@ -126,10 +126,10 @@ def inner_loops(
                 setpoint = inner[RATE_SETPOINT + i, j]
                 error = setpoint - rate if setpoint == setpoint else 0.0
                 acceleration = (rate - inner[LAST_GYRO + i, j]) / dt_s
-                value = gains[RATE_P + i] * error + inner[RATE_INTEGRAL + i, j] - gains[RATE_D + i] * acceleration
+                value = gains[RATE_P + i, j] * error + inner[RATE_INTEGRAL + i, j] - gains[RATE_D + i, j] * acceleration
                 if not held[j]:
-                    limit = gains[RATE_INTEGRAL_LIMIT + i]
-                    integral = inner[RATE_INTEGRAL + i, j] + gains[RATE_I + i] * error * dt_s
+                    limit = gains[RATE_INTEGRAL_LIMIT + i, j]
+                    integral = inner[RATE_INTEGRAL + i, j] + gains[RATE_I + i, j] * error * dt_s
                     inner[RATE_INTEGRAL + i, j] = min(max(integral, -limit), limit)
                 inner[LAST_GYRO + i, j] = rate
                 if i == 0:
@@ -139,13 +139,13 @@ def inner_loops(
                 else:
                     share = (share[0], share[1], value)
             torque = (
-                share[0] * gains[MAX_TORQUE],
-                share[1] * gains[MAX_TORQUE + 1],
-                share[2] * gains[MAX_TORQUE + 2],
+                share[0] * gains[MAX_TORQUE, j],
+                share[1] * gains[MAX_TORQUE + 1, j],
+                share[2] * gains[MAX_TORQUE + 2, j],
             )
         o1, o2, o3, o4, saturated = allocate(
-            demand[THRUST, j] * gains[MAX_THRUST], torque[0], torque[1], torque[2],
-            gains[THRUST_COEFFICIENT], gains[DRAG_COEFFICIENT], gains[ARM], gains[MAX_ROTOR_SPEED],
+            demand[THRUST, j] * gains[MAX_THRUST, j], torque[0], torque[1], torque[2],
+            gains[THRUST_COEFFICIENT, j], gains[DRAG_COEFFICIENT, j], gains[ARM, j], gains[MAX_ROTOR_SPEED, j],
         )  # fmt: skip
         command[0, j], command[1, j], command[2, j], command[3, j] = o1, o2, o3, o4
         inner[SATURATED, j] = float(int(inner[SATURATED, j]) | saturated)
@@ -172,15 +172,15 @@ def fail_motors(x: Array, demand: Array, motors: Array, command: Array) -> None:
 def measure(x: Array, sigma: Array, normals: Array, estimate: Array) -> None:
     """Gaussian white noise on every feedback variable: estimate (13, n) from truth and `normals` (12, n).
 
-    `sigma` (4,): position m, velocity m/s, attitude rad, rate rad/s. The attitude's noise is a small
+    `sigma` (4, n): position m, velocity m/s, attitude rad, rate rad/s. The attitude's noise is a small
     rotation in body axes.
     """
     for j in range(x.shape[1]):
         for i in range(3):
-            estimate[i, j] = x[i, j] + sigma[0] * normals[i, j]
-            estimate[3 + i, j] = x[3 + i, j] + sigma[1] * normals[3 + i, j]
-            estimate[10 + i, j] = x[10 + i, j] + sigma[3] * normals[9 + i, j]
-        half = 0.5 * sigma[2]
+            estimate[i, j] = x[i, j] + sigma[0, j] * normals[i, j]
+            estimate[3 + i, j] = x[3 + i, j] + sigma[1, j] * normals[3 + i, j]
+            estimate[10 + i, j] = x[10 + i, j] + sigma[3, j] * normals[9 + i, j]
+        half = 0.5 * sigma[2, j]
         hx, hy, hz = half * normals[6, j], half * normals[7, j], half * normals[8, j]
         norm = np.sqrt(1.0 + hx * hx + hy * hy + hz * hz)
         w, qx, qy, qz = quaternion_product(
@@ -218,23 +218,26 @@ def advance(
     wind_normals: Array,
     sensor_normals: Array,
     sigma: Array,
-    time_s: float,
+    time_s: Array,
     dt_s: float,
     substeps: int,
 ) -> None:
-    """One tick of `substeps` physics steps from `time_s` on, in place.
+    """One tick of `substeps` physics steps from `time_s` (n,) on, in place.
 
     `wind_normals` (substeps * normals_per_step, n) and `sensor_normals` (substeps * 3 + 12, n) are consumed in order.
     """
     outer_loop(demand, estimate, gains, inner)
     gyro = np.empty((3, x.shape[1]))
+    now_s = np.empty(x.shape[1])
     per_step = wind_normals.shape[0] // substeps
     for k in range(substeps):
         normals = wind_normals[k * per_step : (k + 1) * per_step]
-        wind_step(wind_state, wind_coefficients, normals, time_s + k * dt_s, wind)
+        for j in range(x.shape[1]):
+            now_s[j] = time_s[j] + k * dt_s
+        wind_step(wind_state, wind_coefficients, normals, now_s, wind)
         for j in range(x.shape[1]):
             for i in range(3):
-                gyro[i, j] = x[10 + i, j] + gains[GYRO_SIGMA] * sensor_normals[k * GYRO_NORMALS + i, j]
+                gyro[i, j] = x[10 + i, j] + gains[GYRO_SIGMA, j] * sensor_normals[k * GYRO_NORMALS + i, j]
         inner_loops(gyro, demand, gains, inner, held, dt_s, command)
         fail_motors(x, demand, motors, command)
         rk4_step(x, command, wind, plant, dt_s, held)
@@ -263,7 +266,7 @@ def advance_sensed(
     imu_added: Array,
     gyro_kind: int,
     accel_kind: int,
-    time_s: float,
+    time_s: Array,
     dt_s: float,
     substeps: int,
 ) -> None:
@@ -274,12 +277,15 @@ def advance_sensed(
     outer_loop(demand, estimate, gains, inner)
     n = x.shape[1]
     gyro = np.empty((3, n))
+    now_s = np.empty(n)
     before = np.empty((7, n))
     per_step = wind_normals.shape[0] // substeps
     imu.begin(imu_state, imu_settings, imu_normals[substeps * imu.NORMALS :])
     for k in range(substeps):
         normals = wind_normals[k * per_step : (k + 1) * per_step]
-        wind_step(wind_state, wind_coefficients, normals, time_s + k * dt_s, wind)
+        for j in range(x.shape[1]):
+            now_s[j] = time_s[j] + k * dt_s
+        wind_step(wind_state, wind_coefficients, normals, now_s, wind)
         imu.corrected_gyro(imu_state, gyro)
         inner_loops(gyro, demand, gains, inner, held, dt_s, command)
         fail_motors(x, demand, motors, command)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from mavsitl.codec import Counters
 from mavsitl.dialect import mavlink
@@ -16,21 +17,17 @@ from mavsitl.link.settings import LinkName, Overlay
 from mavsitl.log.block import Array
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
-from mavsitl.services.files import Folder, Quota
-from mavsitl.signing import EPOCH_UNIX_US, Signing, SigningMode, SigningState
+from mavsitl.signing import SigningMode
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot.autopilot import Autopilot
 from mavsitl_vehicle.autopilot.battery import settings as battery_settings
 from mavsitl_vehicle.autopilot.modes import Mode
-from mavsitl_vehicle.autopilot.parameters import Layer, Parameters
-from mavsitl_vehicle.autopilot.plan import PlanError, VehiclePlan
-from mavsitl_vehicle.autopilot.ports import Shared
 from mavsitl_vehicle.autopilot.seated import SeatedLaw
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint
-from mavsitl_vehicle.autopilot.storage import Store, keep_parameters
 from mavsitl_vehicle.autopilot.wind_estimate import WindEstimate
-from mavsitl_vehicle.failures import Change, Failures, Kind, Timeline
-from mavsitl_vehicle.links import LinkControl, initial_links
+from mavsitl_vehicle.failures import Change, Failures, Kind, Timeline, has_sensors
+from mavsitl_vehicle.kept import Kept
+from mavsitl_vehicle.links import LinkControl
 from mavsitl_vehicle.mishaps import Mishaps, ParameterTimeline
 from mavsitl_vehicle.record import Record
 from mavsitl_vehicle.sensors.status import Readings
@@ -39,8 +36,41 @@ from mavsitl_vehicle.simulation import Simulation
 if TYPE_CHECKING:
     from mavsitl.chaos import Chaos
 
-PLAN_SCHEMA = 1
-SIGNING_SCHEMA = 1
+
+class Seat(NamedTuple):
+    """A vehicle's place in a fleet: what is its own before there is an autopilot, and its column of a simulation."""
+
+    kept: Kept
+    failures: Failures
+    simulation: Simulation
+    column: int
+
+
+def take_seats(
+    flights: Sequence[Flight], kept: Sequence[Kept], seed: int, *, first: int = 0, shared_wind: bool = False
+) -> list[Seat]:
+    """For vehicles of one scenario that differ in where they start; those with sensors have a simulation each.
+
+    `first`: the first one's number in the fleet, see `Simulation`.
+    """
+    failures = [Failures() for _ in flights]
+    parameters = [each.parameters for each in kept]
+    if has_sensors(flights[0].scenario):
+        return [
+            Seat(
+                kept[j],
+                failures[j],
+                Simulation(flights[j], parameters[j], seed, 1, failures[j], first=first + j, shared_wind=shared_wind),
+                0,
+            )
+            for j in range(len(flights))
+        ]
+    positions = [flight.scenario.start.position_nwu_m for flight in flights]
+    simulation = Simulation(
+        flights[0], parameters, seed, len(flights), failures,
+        first=first, positions_nwu_m=positions, shared_wind=shared_wind,
+    )  # fmt: skip
+    return [Seat(each, broken, simulation, j) for j, (each, broken) in enumerate(zip(kept, failures, strict=True))]
 
 
 class Vehicle:
@@ -59,6 +89,8 @@ class Vehicle:
         logs: Path | None = None,
         unix_us: Callable[[], int] | None = None,
         trusted: bool = True,
+        forwards: bool = True,
+        seat: Seat | None = None,
     ) -> None:
         """`ports` name the links in order: "offboard", "gcs".
 
@@ -66,47 +98,24 @@ class Vehicle:
         (parameters, plans, the memory card), `logs` where its logs are; None: nothing is kept, or shown. `unix_us` is
         a clock that does not jump, for SYSTEM_TIME and signatures; None: not known, and then there is no signing. A
         first signing key is taken only where the links are `trusted`: on loopback.
+
+        `forwards`: frames of others are passed on from link to link. `seat`: of a fleet; what it keeps, its state,
+        logs and clock, are then the seat's. None: a fleet of one.
         """
         self.period_us = flight.scenario.rates.control_period_us
         self._flight = flight
-        self._system_id = system_id
+        self.system_id = system_id
+        self._forwards = forwards
         self._port_names = tuple(ports)
         self._lockstep = lockstep
-        self._unix_us = unix_us
-        self._notes: list[str] = []
-        """What was wrong before there was an autopilot to say it."""
-        self._booted = False
-        self.parameters = Parameters(
-            *(Layer(name, values) for name, values in initial_links(flight.scenario).items()),
-            Layer(f"airframe {flight.scenario.airframe}", flight.airframe.parameters),
-            Layer(flight.name, flight.scenario.parameters),
-            Layer("system id", {"MAV_SYS_ID": system_id}),
-        )
-        if state is not None:
-            with suppress(OSError):  # the stores say what is wrong
-                state.mkdir(mode=0o700, parents=True, exist_ok=True)  # the signing key will be in it
-        parameter_store = keep_parameters(self.parameters, state, self.warn)
-        self.parameters.put("MAV_SYS_ID", system_id)  # what was kept does not outweigh what was asked for
-        plan_store = Store(state, "plan", PLAN_SCHEMA, self.warn)
-        self.plan = VehiclePlan(
-            report=lambda severity, text: self.autopilot.say(severity, text),
-            changed=lambda mission_type: plan_store.put(self.plan.to_document),
-        )
-        self._load_plan(plan_store)
-        self._signing_store = Store(state, "signing", SIGNING_SCHEMA, self.warn, private=True)
-        self._signing = self._load_signing()
-        self._signing_state = SigningState()
-        """What the signing store was given last."""
-        self._closed = False
-        self._stores = (parameter_store, plan_store, self._signing_store)
-        self._writing: dict[Work, Store] = {}
-        """Taken from the stores, and not known to be written yet."""
-        self._shared = Shared(
-            self.parameters, self.plan, card=self._card(state), logs=logs, signing=self._signing, trusted=trusted
-        )
-        self.failures = Failures()
+        if seat is None:
+            kept = Kept(flight, system_id=system_id, state=state, logs=logs, unix_us=unix_us, trusted=trusted)
+            seat = take_seats([flight], [kept], seed)[0]
+        self.kept, self.failures, self.simulation, self.column = seat
+        self.parameters, self.plan = self.kept.parameters, self.kept.plan
+        self._signing = self.kept.signing
         self._timeline = Timeline(flight, self.failures, lockstep=lockstep)
-        self.simulation = Simulation(flight, self.parameters, seed, failures=self.failures)
+        self.kept.say = lambda severity, text: self.autopilot.say(severity, text)
         self.autopilot = self._boot(0)
         self.links = LinkControl(self.parameters, self.failures, flight.scenario, lockstep=lockstep)
         self.parameters.subscribe(self._on_parameter)
@@ -116,6 +125,8 @@ class Vehicle:
         self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
         self._record = Record(recorder, flight, aboard=self._seated is not None)
         self._now_us = -self.period_us
+        self._running = True
+        """The autopilot does, in this control period."""
         self._boot_us = 0
         """The driver's time at which the autopilot booted last."""
         self._done = False
@@ -145,94 +156,38 @@ class Vehicle:
         """The scenario's."""
         return self._flight.name
 
-    def _load_plan(self, store: Store) -> None:
-        content = store.load()
-        if content:
-            try:
-                self.plan.load_document(content)
-            except PlanError as error:
-                store.set_aside(str(error))
-
-    def _load_signing(self) -> Signing | None:
-        if self._unix_us is None:
-            return None
-        unix_us, state = self._unix_us, SigningState()
-        content = self._signing_store.load()
-        if content:
-            try:
-                state = SigningState.from_bytes(bytes.fromhex(content["state"]))
-            except (KeyError, TypeError, ValueError):
-                self._signing_store.set_aside("signing begins without a key")
-        signing = Signing(lambda: unix_us() - EPOCH_UNIX_US, state=state)
-        signing.policy.mode = SigningMode(int(self.parameters["MAV_SIGN_CFG"]))
-        return signing
-
-    def _card(self, state: Path | None) -> Folder | None:
-        """The memory card; None without a state folder, or where that cannot be used."""
-        if state is None:
-            return None
-        try:
-            return Folder(state / "card", Quota(), settles_later=True)
-        except OSError as error:
-            self.warn(f"{state / 'card'}: no memory card: {error.strerror or error}")
-            return None
-
     def warn(self, text: str) -> None:
         """A warning for whoever flies it: a STATUSTEXT on every link."""
-        if self._booted:
-            self.autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, text)
-        else:
-            self._notes.append(text)
+        self.autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, text)
 
     def unsaved(self, now_us: int) -> list[Work]:
         """What has to be on the disk soon. `now_us` is wall time. See `mavsitl.keep.Keeping`."""
-        if self._signing is not None and not self._closed:
-            self._keep_signing(self._signing.unsaved())
-        work: list[Work] = []
-        for store in self._stores:
-            document = store.take(now_us)
-            if document is not None:
-                self._writing[document] = store
-                work.append(document)
-        if self._shared.card is not None:
-            work += self._shared.card.unsettled()
-        return work
+        return self.kept.unsaved(now_us)
 
     def saved(self, work: Work, error: OSError | None, now_us: int) -> None:
         """What became of what `unsaved` gave."""
-        store = self._writing.pop(work, None)
-        if store is None:
-            if error is not None:
-                self.warn(f"memory card: {error.strerror or error}")
-            return
-        store.written(error, now_us)
-        if store is self._signing_store and self._signing is not None and error is None:
-            self._signing.saved(self._signing_state)
-
-    def _keep_signing(self, state: SigningState | None) -> None:
-        if state is not None:
-            self._signing_state = state
-            self._signing_store.put({"state": state.to_bytes().hex()})
+        self.kept.saved(work, error, now_us)
 
     def _boot(self, now_us: int) -> Autopilot:
         """An autopilot whose clock begins at `now_us` of the driver's."""
-        unix_us = 0 if self._unix_us is None else self._unix_us()
+        kept, simulation, j = self.kept, self.simulation, self.column
+        unix_us = 0 if kept.unix_us is None else kept.unix_us()
         autopilot = Autopilot(
-            self._flight, self._system_id, self._port_names, self.parameters, _Body(self.simulation), self._shared,
-            lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures,
+            self._flight, self.system_id, self._port_names, self.parameters, _Body(simulation, j), kept.shared,
+            lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures, forwards=self._forwards,
         )  # fmt: skip
-        autopilot.estimate = self.simulation.estimate[:, 0].tolist()
-        autopilot.estimator_status = self.simulation.estimator_status
+        autopilot.estimate = simulation.estimate[:, j].tolist()
+        autopilot.estimator_status = simulation.estimator_status
         if not self._lockstep:
             autopilot.set_home_here()  # MAVSDK asks for it as soon as it hears the vehicle
         else:
             for port in autopilot.ports:
                 for message_id in _STATE_MESSAGES[self._flight.scenario.controller.telemetry]:
                     port.schedule.set_interval(message_id, self.period_us, 0)
-        for note in self._notes:
+        for note in kept.notes:
             autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, note)
-        self._notes.clear()
-        self._booted = True
+        kept.notes.clear()
+        kept.warn = self.warn
         return autopilot
 
     def continue_from(self, sequence: int) -> None:
@@ -248,7 +203,7 @@ class Vehicle:
     @property
     def signed_only(self) -> bool:
         """Every link obeys messages alone that carry a good signature."""
-        return self._signing is not None and self._signing.active(self._shared.trusted)
+        return self._signing is not None and self._signing.active(self.kept.shared.trusted)
 
     @property
     def weights(self) -> Array | None:
@@ -305,6 +260,17 @@ class Vehicle:
     def step(self, now_us: int) -> None:
         """Fly from the last step to `now_us`, one control period later, and say what is to be said there."""
         first = self._now_us < 0
+        flight_time_s = self.decide(now_us)
+        if not first:
+            self.simulation.advance(flight_time_s)
+        self.observe(now_us)
+
+    def decide(self, now_us: int) -> float:
+        """Before the physics up to `now_us`: what the inner loops shall follow until then.
+
+        Returns the flight's time at their beginning, negative before the release.
+        """
+        first = self._now_us < 0
         if self._timeline:
             self._timeline.step(self._now_us, self.flight_time_s)
         if self._changes:
@@ -312,25 +278,31 @@ class Vehicle:
         self._now_us = now_us
         if self._chaos is not None:
             self._chaos.step(now_us, self.flight_time_s)
-        running = not (self._mishaps.busy and self._mishaps.step(now_us, self.period_us))
+        self._running = running = not (self._mishaps.busy and self._mishaps.step(now_us, self.period_us))
         if running and self.autopilot.reboot_requested and not self._lockstep:
             self._reboot(now_us)
-        autopilot, simulation = self.autopilot, self.simulation
+        autopilot, simulation, j = self.autopilot, self.simulation, self.column
         now_us -= self._boot_us
-        if not first and now_us:
-            if running:
-                simulation.held[0] = autopilot.land.held
-                simulation.at_rest[0] = autopilot.at_rest
-                setpoint = autopilot.decide(now_us - self.period_us)
-                simulation.set_demand(0, self._inner_law(setpoint))
-            released_us = autopilot.land.released_us
-            flown_s = -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
-            simulation.advance(flown_s)
+        if first or not now_us:
+            return -1.0
         if running:
-            autopilot.estimate = simulation.estimate[:, 0].tolist()
+            simulation.held[j] = autopilot.land.held
+            simulation.at_rest[j] = autopilot.at_rest
+            setpoint = autopilot.decide(now_us - self.period_us)
+            simulation.set_demand(j, self._inner_law(setpoint))
+        released_us = autopilot.land.released_us
+        return -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
+
+    def observe(self, now_us: int) -> None:
+        """After the physics up to `now_us`: what the vehicle makes of it, says and logs."""
+        autopilot, simulation, j = self.autopilot, self.simulation, self.column
+        now_us -= self._boot_us
+        if self._running:
+            autopilot.estimate = simulation.estimate[:, j].tolist()
             autopilot.estimator_status = simulation.estimator_status
             if self._wind is not None:
-                self._wind.update(simulation.estimate, simulation.demand[tick.THRUST, 0], not autopilot.on_ground)
+                estimate = np.ascontiguousarray(simulation.estimate[:, j : j + 1])
+                self._wind.update(estimate, simulation.demand[tick.THRUST, j], not autopilot.on_ground)
                 autopilot.wind = self._wind.value
             autopilot.observe(now_us)
             autopilot.report(now_us)
@@ -356,14 +328,12 @@ class Vehicle:
         """Close the files that clients had open. What is `unsaved` afterwards is the last there is to write."""
         for port in self.autopilot.ports:
             port.close()
-        if self._signing is not None and (self._signing.has_key or self._signing.unsaved() is not None):
-            self._keep_signing(self._signing.closing_state())
-        self._closed = True
+        self.kept.close()
 
     def _after_flight(self) -> None:
         """Ready for the next: where the flight began in a clamp, the clamp takes the vehicle back."""
         if self._flight.scenario.start.clamp:
-            self.simulation.put_back()
+            self.simulation.put_back(self.column)
             self.autopilot.land.put_back()
         if self.autopilot.on_ground:
             self.autopilot.land.released_us = None
@@ -375,7 +345,7 @@ class Vehicle:
         """
         old = self.autopilot
         if not old.health.upright and old.on_ground:
-            self.simulation.set_upright()
+            self.simulation.set_upright(self.column)
         self.simulation.restart_estimator()
         self._boot_us = now_us
         self._mishaps.mend()
@@ -387,7 +357,7 @@ class Vehicle:
             before.close()
 
     def _on_parameter(self, name: str, value: float) -> None:
-        self.simulation.set_parameter(name)
+        self.simulation.set_parameter(self.column, name)
         if name == "MAV_SIGN_CFG" and self._signing is not None:
             self._signing.policy.mode = SigningMode(int(value))
         if name.startswith(("BAT", "SIM_BAT")):
@@ -408,23 +378,24 @@ class Vehicle:
             return setpoint
         if self.autopilot.land.released_us is None:
             law.reset()
-        return law.update(setpoint, self.autopilot.setpoint_us or 0, self.simulation.estimate[:, 0])
+        return law.update(setpoint, self.autopilot.setpoint_us or 0, self.simulation.estimate[:, self.column])
 
 
 class _Body:
     """The simulation as the autopilot's telemetry looks at it."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: Simulation, column: int) -> None:
         self._simulation = simulation
+        self._column = column
 
     @property
     def truth(self) -> Sequence[float]:
-        truth: list[float] = self._simulation.x[:, 0].tolist()
+        truth: list[float] = self._simulation.x[:, self._column].tolist()
         return truth
 
     @property
     def true_wind(self) -> Vector:
-        x, y, z = self._simulation.wind[:, 0].tolist()
+        x, y, z = self._simulation.wind[:, self._column].tolist()
         return x, y, z
 
     @property
@@ -433,22 +404,23 @@ class _Body:
 
     @property
     def rotor_speeds_rad_s(self) -> Sequence[float]:
-        speeds: list[float] = self._simulation.x[13:17, 0].tolist()
+        speeds: list[float] = self._simulation.x[13:17, self._column].tolist()
         return speeds
 
     @property
     def outputs(self) -> Sequence[float]:
-        largest = self._simulation.gains[tick.MAX_ROTOR_SPEED]
-        shares: list[float] = (self._simulation.motors.commanded_rad_s / largest).tolist()
+        simulation, j = self._simulation, self._column
+        largest = simulation.gains[tick.MAX_ROTOR_SPEED, j]
+        shares: list[float] = (simulation.motors[j].commanded_rad_s / largest).tolist()
         return shares
 
     @property
     def specific_force_flu_m_s2(self) -> Vector:
-        return self._simulation.specific_force(0)
+        return self._simulation.specific_force(self._column)
 
     @property
     def rate_setpoint_flu_rad_s(self) -> Vector:
-        p, q, r = self._simulation.inner[tick.RATE_SETPOINT : tick.RATE_SETPOINT + 3, 0].tolist()
+        p, q, r = self._simulation.inner[tick.RATE_SETPOINT : tick.RATE_SETPOINT + 3, self._column].tolist()
         return p, q, r
 
 
@@ -458,6 +430,13 @@ _STATE_MESSAGES = {
 }
 
 
-def build(flight: Flight, recorder: Recorder, **options: Any) -> Vehicle:
-    """The entry point `mavsitl.vehicle`: a vehicle core for the bridge's drivers."""
-    return Vehicle(flight, recorder, **options)
+def build(flight: Flight, recorder: Any, *, count: int | None = None, **options: Any) -> Any:
+    """The entry point `mavsitl.vehicle`: a vehicle core for the bridge's drivers; with `count` a `Fleet`.
+
+    `recorder` is one of these, for a fleet as many.
+    """
+    if count is None:
+        return Vehicle(flight, recorder, **options)
+    from mavsitl_vehicle.fleet import Fleet  # here, for it is made of vehicles
+
+    return Fleet(flight, recorder, count=count, **options)

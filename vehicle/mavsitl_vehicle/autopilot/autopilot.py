@@ -100,8 +100,12 @@ class Autopilot:
         lockstep: bool = False,
         unix_boot_us: int = 0,
         failures: Failures | None = None,
+        forwards: bool = True,
     ) -> None:
-        """`failures`: what is broken of the battery, the sticks, the links and, by what it is told, the motors."""
+        """`failures`: what is broken of the battery, the sticks, the links and, by what it is told, the motors.
+
+        `forwards`: frames of others are passed on from link to link.
+        """
         scenario, airframe = flight.scenario, flight.airframe
         self.system_id = system_id
         self.unix_boot_us = self._true_unix_boot_us = unix_boot_us
@@ -178,6 +182,7 @@ class Autopilot:
         self._housekept_us = -HOUSEKEEPING_US
         self._plan_watch = PlanWatch(shared.plan, self.origin, parameters, lambda text: self.warn("mission", text))
         self._fence_breach: str | None = None
+        self._forwards = forwards and len(port_names) > 1
         self._router = Router(len(port_names), (system_id, COMPONENT_ID))
         self.ports = tuple(Port(name, index, self, shared, lockstep=lockstep) for index, name in enumerate(port_names))
         self._handlers = {
@@ -207,7 +212,7 @@ class Autopilot:
         node = port.node
         frames = node.receive(datagram)
         self._now_us = now_us
-        several = len(self.ports) > 1
+        several = self._forwards
         signed_only = node.signing is not None and node.signing.active
         for frame in frames if node.tamper is None else node.tamper.incoming(frames):
             if several and (frame.signed or not signed_only):

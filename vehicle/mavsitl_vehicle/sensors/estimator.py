@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from heapq import heappop, heappush
 from math import radians, sqrt
 
@@ -64,14 +65,16 @@ _E_Z = ekf.E_POSITION + 2
 
 
 class SensedEstimator:
-    """The fleet's sensors and filters; status and readings are vehicle 0's.
+    """Sensors and filters of vehicles with one set of parameters and failures; status and readings are the first's.
 
     `update` after each control period's physics, whose IMU samples `tick.advance_sensed` took.
     """
 
     def __init__(
-        self, flight: Flight, parameters: Parameters, failures: Failures, seed: int, x: Array, dt_s: float
-    ) -> None:
+        self, flight: Flight, parameters: Parameters, failures: Failures, seed: int, x: Array, dt_s: float,
+        vehicles: Sequence[int],
+    ) -> None:  # fmt: skip
+        """`x` (17, n) at rest; `vehicles`: the numbers in the fleet of its columns, by which their errors are drawn."""
         scenario = flight.scenario
         settings, n = scenario.estimator, x.shape[1]
         self._settings = settings
@@ -83,12 +86,12 @@ class SensedEstimator:
         start = scenario.start
         field = Origin(start.latitude_deg, start.longitude_deg, start.altitude_amsl_m).magnetic_field_nwu_gauss
         self._field = np.array(field)
-        self._start = np.array(start.position_nwu_m)[:, None]
-        self.imu = Imu(settings.imu, self._gravity, dt_s, self._period_s, seed, n)
-        self.gps = Gps(settings.gps, parameters, failures, seed, n)
-        self.barometer = Barometer(settings.barometer, parameters, failures, seed, n)
-        self.magnetometer = Magnetometer(settings.magnetometer, field, parameters, failures, seed, n)
-        self._coins = {unit: Coin(unit, seed) for unit in (Unit.GYRO, Unit.ACCEL)}
+        self._start = x[0:3].copy()
+        self.imu = Imu(settings.imu, self._gravity, dt_s, self._period_s, seed, vehicles)
+        self.gps = Gps(settings.gps, parameters, failures, seed, vehicles)
+        self.barometer = Barometer(settings.barometer, parameters, failures, seed, vehicles)
+        self.magnetometer = Magnetometer(settings.magnetometer, field, parameters, failures, seed, vehicles)
+        self._coins = {unit: Coin(unit, seed, vehicles[0]) for unit in (Unit.GYRO, Unit.ACCEL)}
         self.now_us = 0
 
         self.x = np.zeros((ekf.STATE_ROWS, n))

@@ -20,9 +20,9 @@ DEFAULT_SLOT_US = 500_000
 class Coin:
     """Is an intermittent sensor there now? Heads or tails for each slot of time."""
 
-    def __init__(self, unit: Unit, seed: int) -> None:
+    def __init__(self, unit: Unit, seed: int, vehicle: int) -> None:
         self._slot_us = SLOT_US.get(unit, DEFAULT_SLOT_US)
-        self._generator = seeds.generator(seed, "vehicle", 0, "failures", unit.name)
+        self._generator = seeds.generator(seed, "vehicle", vehicle, "failures", unit.name)
         self._until_us = -1
         self._there = True
 
@@ -36,15 +36,17 @@ class Coin:
 class Fault:
     """One sensor's, for all vehicles alike. `wrong` (rows,) is added while WRONG, `garbage` (rows,) 1 sigma of GARBAGE.
 
-    Garbage is drawn from a generator of its own, so that a failure does not change the noise after it.
+    Garbage is drawn from a generator of `vehicle`'s own, so that a failure does not change the noise after it.
     """
 
-    def __init__(self, unit: Unit, wrong: tuple[float, ...], garbage: tuple[float, ...], seed: int) -> None:
+    def __init__(
+        self, unit: Unit, wrong: tuple[float, ...], garbage: tuple[float, ...], seed: int, vehicle: int
+    ) -> None:
         self.unit = unit
         self._wrong = np.array(wrong)[:, None]
         self._garbage = np.array(garbage)[:, None]
-        self._generator = seeds.generator(seed, "vehicle", 0, "failures", unit.name, "garbage")
-        self._coin = Coin(unit, seed)
+        self._generator = seeds.generator(seed, "vehicle", vehicle, "failures", unit.name, "garbage")
+        self._coin = Coin(unit, seed, vehicle)
         self._count = 0
         self._stuck: Array | None = None
 

@@ -6,6 +6,7 @@ its bias and its failures.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import radians, sqrt
 
 import numpy as np
@@ -163,11 +164,12 @@ class Imu:
     """
 
     def __init__(
-        self, settings: Settings, gravity_m_s2: float, dt_s: float, period_s: float, seed: int, n: int
+        self, settings: Settings, gravity_m_s2: float, dt_s: float, period_s: float, seed: int, vehicles: Sequence[int]
     ) -> None:
         self._settings = settings
         self._dt_s = dt_s
-        self.generators = [seeds.generator(seed, "vehicle", j, "imu") for j in range(n)]
+        self.generators = [seeds.generator(seed, "vehicle", j, "imu") for j in vehicles]
+        n = len(vehicles)
         self.state: Array = np.zeros((STATE_ROWS, n))
         gyro_bias, accel_bias = radians(settings.gyro_bias_deg_s), settings.accel_bias_m_s2
         sigma = np.array([gyro_bias] * 3 + [accel_bias] * 3)[:, None]

@@ -6,6 +6,7 @@ when it came, less the delay that the filter knows of.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from heapq import heappop, heappush
 from math import exp, sqrt
 from typing import NamedTuple
@@ -97,10 +98,13 @@ class Gps(SlowSensor):
     WRONG = (20.0, 20.0, 10.0, 0.0, 0.0, 0.0)
     GARBAGE = (50.0, 50.0, 50.0, 5.0, 5.0, 5.0)
 
-    def __init__(self, settings: GpsSettings, parameters: Values, failures: Failures, seed: int, n: int) -> None:
-        super().__init__(Fault(Unit.GPS, self.WRONG, self.GARBAGE, seed), settings.rate_hz, settings.delay_ms, failures)
+    def __init__(
+        self, settings: GpsSettings, parameters: Values, failures: Failures, seed: int, vehicles: Sequence[int]
+    ) -> None:
+        fault = Fault(Unit.GPS, self.WRONG, self.GARBAGE, seed, vehicles[0])
+        super().__init__(fault, settings.rate_hz, settings.delay_ms, failures)
         self._parameters = parameters
-        self._generators = [seeds.generator(seed, "vehicle", j, "gps") for j in range(n)]
+        self._generators = [seeds.generator(seed, "vehicle", j, "gps") for j in vehicles]
         h, v, s = settings.horizontal_noise_m, settings.vertical_noise_m, settings.velocity_noise_m_s
         self._sigma = np.array([h, h, v, s, s, s])[:, None]
         h, v = settings.horizontal_drift_m, settings.vertical_drift_m
@@ -134,12 +138,13 @@ class Barometer(SlowSensor):
     WRONG = (15.0,)
     GARBAGE = (50.0,)
 
-    def __init__(self, settings: BarometerSettings, parameters: Values, failures: Failures, seed: int, n: int) -> None:
-        super().__init__(
-            Fault(Unit.BARO, self.WRONG, self.GARBAGE, seed), settings.rate_hz, settings.delay_ms, failures
-        )
+    def __init__(
+        self, settings: BarometerSettings, parameters: Values, failures: Failures, seed: int, vehicles: Sequence[int]
+    ) -> None:
+        fault = Fault(Unit.BARO, self.WRONG, self.GARBAGE, seed, vehicles[0])
+        super().__init__(fault, settings.rate_hz, settings.delay_ms, failures)
         self._parameters = parameters
-        self._generators = [seeds.generator(seed, "vehicle", j, "barometer") for j in range(n)]
+        self._generators = [seeds.generator(seed, "vehicle", j, "barometer") for j in vehicles]
         self._noise_m = settings.noise_m
         self._walk_m = settings.drift_m_rt_s / sqrt(settings.rate_hz)
         self._offset = settings.offset_m * np.array([[g.standard_normal() for g in self._generators]])
@@ -176,11 +181,12 @@ class Magnetometer(SlowSensor):
         parameters: Values,
         failures: Failures,
         seed: int,
-        n: int,
+        vehicles: Sequence[int],
     ) -> None:
-        super().__init__(Fault(Unit.MAG, self.WRONG, self.GARBAGE, seed), settings.rate_hz, settings.delay_ms, failures)
+        fault = Fault(Unit.MAG, self.WRONG, self.GARBAGE, seed, vehicles[0])
+        super().__init__(fault, settings.rate_hz, settings.delay_ms, failures)
         self._parameters = parameters
-        self._generators = [seeds.generator(seed, "vehicle", j, "magnetometer") for j in range(n)]
+        self._generators = [seeds.generator(seed, "vehicle", j, "magnetometer") for j in vehicles]
         self._noise = settings.noise_gauss
         self._field = np.array(field_nwu_gauss)
         self._offset = settings.offset_gauss * np.stack([g.standard_normal(3) for g in self._generators], axis=-1)
