@@ -241,6 +241,8 @@ class _NullRows:
 class NullRecorder:
     """Keeps nothing: for an end that runs without a folder."""
 
+    keeps = False
+
     def topic(self, topic: Any) -> Any:
         return _NullRows()
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mavsitl.frames import flip_vector
 from mavsitl.log.topics import Topic
-from mavsitl.log.ulog import Recorder
+from mavsitl.log.ulog import Recorder, Rows
 
 Array: TypeAlias = NDArray[np.float64]
 Split: TypeAlias = Callable[[Array], Array]
@@ -26,7 +26,7 @@ class Block:
         self._stamps = np.zeros(BLOCK_ROWS, dtype=np.uint64)
         self._values = np.zeros((BLOCK_ROWS, width))
         self._count = 0
-        self._targets = [(recorder.topic(topic), split) for topic, split in topics]
+        self._targets = _targets(recorder, topics)
         recorder.attach(self.drain)
 
     def row(self, timestamp_us: int) -> Array:
@@ -45,6 +45,38 @@ class Block:
         if count:
             for rows, split in self._targets:
                 rows.extend(self._stamps[:count], split(self._values[:count]))
+
+
+class Window:
+    """As `Block`, of rows that something else keeps, a kernel say: what `take` is told of."""
+
+    def __init__(
+        self, recorder: Recorder, topics: Sequence[tuple[Topic, Split]], newest: Callable[[int], Array]
+    ) -> None:
+        """`newest(k)` gives the last k rows (k, width), the oldest first; k is at most `BLOCK_ROWS`."""
+        self._newest = newest
+        self._stamps: list[int] = []
+        self._targets = _targets(recorder, topics)
+        recorder.attach(self.drain)
+
+    def take(self, timestamp_us: int) -> None:
+        """There is one more row."""
+        stamps = self._stamps
+        stamps.append(timestamp_us)
+        if len(stamps) == BLOCK_ROWS:
+            self.drain()
+
+    def drain(self) -> None:
+        """Hand over what was taken."""
+        stamps, self._stamps = self._stamps, []
+        if stamps and self._targets:
+            times, values = np.array(stamps, dtype=np.uint64), self._newest(len(stamps))
+            for rows, split in self._targets:
+                rows.extend(times, split(values))
+
+
+def _targets(recorder: Recorder, topics: Sequence[tuple[Topic, Split]]) -> list[tuple[Rows, Split]]:
+    return [(recorder.topic(topic), split) for topic, split in topics] if recorder.keeps else []
 
 
 def ned(vectors: Array) -> Array:

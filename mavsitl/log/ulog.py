@@ -88,6 +88,10 @@ class Rows:
 class Recorder(Protocol):
     """What a wing logs to."""
 
+    @property
+    def keeps(self) -> bool:
+        """False: every row is dropped, and need not be made."""
+
     def topic(self, topic: Topic) -> Rows:
         """The rows of `topic`; the same object each time."""
 
@@ -100,6 +104,8 @@ class Recorder(Protocol):
 
 class MemoryRecorder:
     """Keeps everything in memory."""
+
+    keeps = True
 
     def __init__(self) -> None:
         self._rows: dict[str, tuple[Rows, _Sink]] = {}
@@ -207,6 +213,8 @@ class UlogWriter:
     `info` holds strings (PX4's keys: sys_name, ver_sw, ...); `parameters` are logged as float, an int value as int32_t;
     `topics` are those that may be asked for. Raises `LogError` when the file cannot be written.
     """
+
+    keeps = True
 
     def __init__(
         self,

@@ -7,6 +7,7 @@ from math import nan
 from typing import Any
 
 import pytest
+from mavsitl_vehicle.autopilot.setpoints import ATTITUDE_TARGET_FIELDS, Refusal, Setpoint, from_attitude_target
 from mavsitl_vehicle.vehicle import Vehicle
 
 from mavsitl.codec import encode, parse
@@ -225,6 +226,12 @@ class Client:
             return bool(abs(height_m + state.z) < 0.1 and abs(state.vz) < 0.15)
 
         self.run_until(there, 20.0, pilot)
+
+
+def taken_of(message: Any) -> Setpoint | Refusal:
+    """What a SET_ATTITUDE_TARGET asks for; `message` may have a `thrust_body`."""
+    names = dict.fromkeys((*ATTITUDE_TARGET_FIELDS, "thrust_body"))
+    return from_attitude_target(*(getattr(message, name) for name in names if hasattr(message, name)))
 
 
 def attitude_target(

@@ -13,13 +13,13 @@ from mavsitl_vehicle.autopilot.setpoints import (
     RateSetpoint,
     Refusal,
     State,
-    from_attitude_target,
     from_position_target_global_int,
     from_position_target_local_ned,
 )
 
 from mavsitl.dialect import mavlink
 from mavsitl.quaternion import from_euler
+from tests.autopilot.conftest import taken_of
 
 FIELDS = ("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz")
 VALUES = dict(zip(FIELDS, (1.0, 2.0, 3.0, 0.5, 0.25, 0.125, 4.0, 8.0, 16.0), strict=True))
@@ -315,19 +315,19 @@ def attitude(mask: int, thrust_body: tuple[float, float, float], thrust: float =
 
 @pytest.mark.parametrize(("z", "flown"), [(-0.3, 0.3), (0.2, 0.0), (-1.5, 1.0)])
 def test_thrust_body_gives_the_collective(z: float, flown: float) -> None:
-    taken = from_attitude_target(attitude(32 | 7, (0.1, 0.1, z), thrust=nan))
+    taken = taken_of(attitude(32 | 7, (0.1, 0.1, z), thrust=nan))
     assert isinstance(taken, AttitudeSetpoint)
     assert taken.thrust == flown
-    taken = from_attitude_target(attitude(32 | 128, (0.0, 0.0, z)))
+    taken = taken_of(attitude(32 | 128, (0.0, 0.0, z)))
     assert isinstance(taken, RateSetpoint)
     assert taken.thrust == flown
 
 
 def test_thrust_body_only_where_the_mask_says_so() -> None:
-    taken = from_attitude_target(attitude(7, (0.0, 0.0, -0.3)))
+    taken = taken_of(attitude(7, (0.0, 0.0, -0.3)))
     assert isinstance(taken, AttitudeSetpoint)
     assert taken.thrust == 0.9
-    taken = from_attitude_target(attitude(32 | 64 | 7, (0.0, 0.0, -0.3)))
+    taken = taken_of(attitude(32 | 64 | 7, (0.0, 0.0, -0.3)))
     assert isinstance(taken, AttitudeSetpoint)
     assert taken.thrust == 0.0
-    assert isinstance(from_attitude_target(attitude(32 | 7, (0.0, 0.0, nan))), Refusal)
+    assert isinstance(taken_of(attitude(32 | 7, (0.0, 0.0, nan))), Refusal)

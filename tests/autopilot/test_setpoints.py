@@ -12,11 +12,10 @@ from mavsitl_vehicle.autopilot.setpoints import (
     Refusal,
     TorqueSetpoint,
     from_actuator_control_target,
-    from_attitude_target,
 )
 
 from mavsitl.dialect import mavlink
-from tests.autopilot.conftest import Client, attitude_target
+from tests.autopilot.conftest import Client, attitude_target, taken_of
 
 # The rule, from MAVLink's bit list as PX4 reads it. Columns: bit 7 (attitude ignored), bit 1 (pitch rate ignored) and
 # bit 0 (roll rate ignored); then what the message is. Bits 3 and 4 say nothing; bit 5 asks for a field that the message
@@ -43,7 +42,7 @@ def expected_kind(type_mask: int) -> str:
 
 @pytest.mark.parametrize("type_mask", range(256))
 def test_every_type_mask(type_mask: int) -> None:
-    taken = from_attitude_target(attitude_target(type_mask, q=EXACT, rates=RATES, thrust=0.625))
+    taken = taken_of(attitude_target(type_mask, q=EXACT, rates=RATES, thrust=0.625))
     bits = f"{type_mask:08b}"
     thrust = 0.0 if bits[1] == "1" else 0.625
     yaw_ignored = bits[5] == "1"
@@ -95,25 +94,25 @@ def test_a_field_that_is_not_finite_refuses_where_it_is_used(type_mask: int, fie
     values = dict(zip(FIELDS, (*EXACT, *RATES, 0.625), strict=True)) | {field: bad}
     q = (values["q0"], values["q1"], values["q2"], values["q3"])
     rates = (values["roll"], values["pitch"], values["yaw"])
-    taken = from_attitude_target(attitude_target(type_mask, q=q, rates=rates, thrust=values["thrust"]))
+    taken = taken_of(attitude_target(type_mask, q=q, rates=rates, thrust=values["thrust"]))
     assert isinstance(taken, Refusal) == (field in USED[type_mask])
 
 
 @pytest.mark.parametrize(("norm", "good"), [(0.0, False), (0.98, False), (0.995, True), (1.005, True), (1.02, False)])
 def test_quaternion_norm(norm: float, good: bool) -> None:
     q = (0.6 * norm, 0.0, 0.8 * norm, 0.0)
-    taken = from_attitude_target(attitude_target(7, q=q))
+    taken = taken_of(attitude_target(7, q=q))
     assert isinstance(taken, AttitudeSetpoint) == good
     if isinstance(taken, AttitudeSetpoint):
         assert taken.attitude == pytest.approx((0.6, 0.0, -0.8, 0.0), abs=1e-12)
-    unused = from_attitude_target(attitude_target(128, q=q))
+    unused = taken_of(attitude_target(128, q=q))
     assert isinstance(unused, RateSetpoint)
 
 
 @pytest.mark.parametrize(("sent", "flown"), [(-3.0e7, 0.0), (-0.1, 0.0), (0.3, 0.3), (1.0, 1.0), (1.5, 1.0)])
 @pytest.mark.parametrize("type_mask", [7, 128])
 def test_thrust_is_clipped(type_mask: int, sent: float, flown: float) -> None:
-    taken = from_attitude_target(attitude_target(type_mask, thrust=sent))
+    taken = taken_of(attitude_target(type_mask, thrust=sent))
     assert not isinstance(taken, Refusal)
     assert taken.thrust == flown
 
@@ -133,7 +132,7 @@ HALF = radians(15.0)
     ],
 )
 def test_attitude_signs(name: str, frd: tuple[float, float, float, float], flu: tuple[float, ...]) -> None:
-    taken = from_attitude_target(attitude_target(7, q=frd))
+    taken = taken_of(attitude_target(7, q=frd))
     assert isinstance(taken, AttitudeSetpoint)
     assert taken.attitude == pytest.approx(flu, abs=1e-12)
 

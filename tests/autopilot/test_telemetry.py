@@ -443,13 +443,14 @@ def wild_subject(value: float) -> Told:
     pack.voltage_v = pack.current_a = pack.consumed_ah = pack.consumed_j = value
     limit = 1e9 if value == value else value  # of a rotor speed: its cube is sent
     three = (value, value, value)
+    status = EstimatorStatus(True, True, True, True, False, *(value,) * 11)
     return Told(
         unix_boot_us=2**62,
         load=value,
         battery=pack,
         estimate=state,
-        estimator_status=EstimatorStatus(True, True, True, True, False, *(value,) * 11),
-        accuracy=Accuracy(value, value, [value] * 21, [value] * 21),
+        estimator_status=status,
+        accuracy=accuracy(status),
         specific_force_flu_m_s2=three,
         truth=(*state, *(min(max(value, -limit), limit),) * 4),
         true_wind=three,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -11,13 +12,13 @@ from mavsitl.dialect import mavlink
 from mavsitl.frames import flip_quaternion
 from mavsitl.geodesy import Origin
 from mavsitl.log import topics
-from mavsitl.log.block import Array, Block, ned
+from mavsitl.log.block import Array, Block, Window, ned
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot import modes
+from mavsitl_vehicle.autopilot.autopilot import Shown
 from mavsitl_vehicle.autopilot.health import Health
-from mavsitl_vehicle.autopilot.modes import Mode
 from mavsitl_vehicle.autopilot.telemetry import atmosphere, estimator_flags
 from mavsitl_vehicle.failures import Change, has_sensors
 from mavsitl_vehicle.sensors import ekf, imu
@@ -25,15 +26,11 @@ from mavsitl_vehicle.sensors.estimator import SensedEstimator
 from mavsitl_vehicle.sensors.status import EstimatorStatus
 
 if TYPE_CHECKING:
+    from mavsitl_vehicle.simulation import Simulation
     from mavsitl_vehicle.vehicle import Vehicle
 
-# Columns of the vehicle's log block.
-_TRUTH = slice(0, 17)
-_ESTIMATE = slice(17, 30)
-_WIND = slice(30, 33)
-_INNER = slice(33, 37)
-_THRUST = 37
-_WIDTH = 38
+_WIND = slice(tick.LOG_WIND, tick.LOG_WIND + 3)
+_RATE_SETPOINT = slice(tick.LOG_RATE_SETPOINT, tick.LOG_RATE_SETPOINT + 3)
 
 PORTS_US = 1_000_000
 """Between two rows of the ports' counters."""
@@ -42,12 +39,11 @@ PORTS_US = 1_000_000
 class Record:
     """The vehicle's log: truth beside estimate every tick, states when they change."""
 
-    def __init__(self, recorder: Recorder, flight: Flight, aboard: bool) -> None:
-        """`aboard`: the nets are, so their weights are logged here."""
+    def __init__(self, recorder: Recorder, flight: Flight, simulation: Simulation, column: int, aboard: bool) -> None:
+        """`column`: the vehicle's of the simulation; `aboard`: the nets are, so their weights are logged here."""
         largest = flight.airframe.max_rotor_speed_rad_s
-        self._block = Block(
+        self._window = Window(
             recorder,
-            _WIDTH,
             (
                 (topics.LOCAL_POSITION_TRUTH, lambda v: np.hstack((ned(v[:, 0:3]), ned(v[:, 3:6])))),
                 (topics.ATTITUDE_TRUTH, lambda v: np.column_stack(flip_quaternion(*v[:, 6:10].T))),
@@ -57,9 +53,13 @@ class Record:
                 (topics.ANGULAR_VELOCITY, lambda v: ned(v[:, 27:30])),
                 (topics.WIND_TRUTH, lambda v: ned(v[:, _WIND])),
                 (topics.ACTUATOR_MOTORS, lambda v: v[:, 13:17] / largest),
-                (topics.ROTOR_STATUS, lambda v: np.column_stack((v[:, 13:17], v[:, 36]))),
-                (topics.RATES_SETPOINT, lambda v: np.column_stack((ned(v[:, 33:36]), _thrust_frd(v[:, _THRUST])))),
+                (topics.ROTOR_STATUS, lambda v: np.column_stack((v[:, 13:17], v[:, tick.LOG_SATURATED]))),
+                (
+                    topics.RATES_SETPOINT,
+                    lambda v: np.column_stack((ned(v[:, _RATE_SETPOINT]), _thrust_frd(v[:, tick.LOG_THRUST]))),
+                ),
             ),
+            partial(simulation.logged, column),
         )
         self._sensors = SensorRecord(recorder, flight) if has_sensors(flight.scenario) else None
         self._weights = recorder.topic(topics.PIDNN_WEIGHTS) if aboard else None
@@ -68,8 +68,7 @@ class Record:
         self._failures = recorder.topic(topics.INJECTED_FAILURE)
         self._recorder = recorder
         self._ports_due_us = 0
-        self._last_status: tuple[bool, Mode, bool] | None = None
-        self._last_land: int | None = None
+        self._shown: Shown | None = None
 
     def failed(self, now_us: int, severity: int, change: Change) -> None:
         """A failure was injected or cleared."""
@@ -80,31 +79,29 @@ class Record:
         self._recorder.message(now_us, severity, text)
 
     def write(self, now_us: int, vehicle: Vehicle) -> None:
-        simulation, autopilot, j = vehicle.simulation, vehicle.autopilot, vehicle.column
-        row = self._block.row(now_us)
-        row[_TRUTH] = simulation.x[:, j]
-        row[_ESTIMATE] = simulation.estimate[:, j]
-        row[_WIND] = simulation.wind[:, j]
-        row[_INNER] = simulation.inner[tick.RATE_SETPOINT : tick.SATURATED + 1, j]
-        row[_THRUST] = simulation.demand[tick.THRUST, j]
-        if self._sensors is not None and simulation.sensed is not None:
-            self._sensors.write(now_us, simulation.sensed, autopilot.health)
+        """The vehicle's step to `now_us` is done."""
+        autopilot = vehicle.autopilot
+        self._window.take(now_us)
+        if self._sensors is not None and vehicle.simulation.sensed is not None:
+            self._sensors.write(now_us, vehicle.simulation.sensed, autopilot.health)
         if self._weights is not None and vehicle.weights is not None:
             self._weights.append(now_us, *vehicle.weights[:, :, 0].T.ravel().tolist())
         if now_us >= self._ports_due_us:
             self._ports_due_us = now_us + PORTS_US
             self._write_ports(now_us, vehicle)
-        commander = autopilot.commander
-        status = (commander.armed, commander.mode, commander.failsafe)
-        if status != self._last_status:
-            self._last_status = status
-            nav_state = modes.TABLE[commander.mode].nav_state
+        if autopilot.shown is not self._shown and autopilot.shown is not None:
+            self._write_state(now_us, autopilot.shown)
+
+    def _write_state(self, now_us: int, shown: Shown) -> None:
+        """Of what is shown the log tells what it does not tell already."""
+        before, self._shown = self._shown, shown
+        if before is None or shown[:3] != before[:3]:
             self._status.append(
-                now_us, topics.ARMED if commander.armed else topics.DISARMED, nav_state, int(commander.failsafe)
-            )
-        landed = int(autopilot.land.released_us is None or autopilot.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND)
-        if landed != self._last_land:
-            self._last_land = landed
+                now_us, topics.ARMED if shown.armed else topics.DISARMED, modes.TABLE[shown.mode].nav_state,
+                int(shown.failsafe),
+            )  # fmt: skip
+        landed = int(shown.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND)
+        if before is None or landed != int(before.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND):
             self._land.append(now_us, landed, landed)
 
     def _write_ports(self, now_us: int, vehicle: Vehicle) -> None:

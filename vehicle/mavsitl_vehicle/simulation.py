@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
 from math import nan, radians
 
@@ -30,6 +31,11 @@ TURBULENCE_HEIGHT_M = 6.096
 BLOCK_TICKS = 250
 """Normals are drawn for this many ticks at once."""
 
+_PACK_DEMAND = struct.Struct(f"={tick.DEMAND_ROWS}d").pack_into
+_DEMAND_BYTES = 8 * tick.DEMAND_ROWS
+_NOTHING = (0.0, 0.0, 0.0)
+_LEVEL = (1.0, 0.0, 0.0, 0.0)
+
 WARM_UP_US = 1_000_000
 """In so much time at rest a filter uses everything that it has."""
 
@@ -43,6 +49,7 @@ class Simulation:
     Attributes:
         sensed: sensors and filter; None: the estimate is the truth with white noise.
         held: (n,) in the clamp.
+        estimates: the columns of `estimate` as lists.
         at_rest: (n,) the vehicle knows that it does not move: on the ground, or in the clamp.
     """
 
@@ -77,22 +84,33 @@ class Simulation:
         self._start = initial_state(scenario.start.position_nwu_m, radians(scenario.start.yaw_deg), 0.0, n)
         if positions_nwu_m is not None:
             self._start[0:3] = np.array(positions_nwu_m).T
-        self.x = self._start.copy()
-        self.wind = np.zeros((3, n))
-        self.estimate = np.zeros((tick.ESTIMATE_ROWS, n))
-        self.demand = np.zeros((tick.DEMAND_ROWS, n))
+        rows = self._rows = np.zeros((tick.ROWS, n))
+        self.x = rows[tick.X : tick.X + tick.X_ROWS]
+        self.x[:] = self._start
+        self.estimate = rows[tick.ESTIMATE_AT : tick.WIND_AT]
+        self.wind = rows[tick.WIND_AT : tick.INNER_AT]
+        self.inner = rows[tick.INNER_AT : tick.MOTORS_AT]
+        self._motor_rows = rows[tick.MOTORS_AT : tick.COMMAND_AT]
+        self._command = rows[tick.COMMAND_AT : tick.VELOCITY_AT]
+        self._velocity = rows[tick.VELOCITY_AT : tick.TIME_AT]
+        self._velocity[:] = self.x[3:6]
+        self._flight_time_s = rows[tick.TIME_AT]
+        self.gains = rows[tick.GAINS_AT : tick.SIGMA_AT]
+        self.sigma = rows[tick.SIGMA_AT : tick.PLANT_AT]
+        self.plant = rows[tick.PLANT_AT :]
+        self.estimates: list[list[float]] = self.estimate.T.tolist()
+        self._asked = np.zeros((n, tick.DEMAND_ROWS))
+        self._asked_bytes = self._asked.data.cast("B")
+        self.demand = self._asked.T
         self.demand[tick.ATTITUDE] = 1.0
-        self.inner = np.zeros((tick.INNER_ROWS, n))
+        self._log = np.zeros((BLOCK_TICKS, tick.LOG_WIDTH, n))
+        """The row of what is now is number `_tick`, modulo its length."""
         self.held = np.full(n, scenario.start.clamp)
         self.at_rest = np.ones(n, dtype=np.bool_)
-        self.plant = np.hstack([self._plant(j) for j in range(n)])
-        self.gains = np.stack([_gains(flight, each) for each in self._parameters], axis=-1)
-        self.sigma = np.stack([self._sigma(j) for j in range(n)], axis=-1)
-        self._flight_time_s = np.zeros(n)
-        self._velocity = self.x[3:6].copy()
-        """At the beginning of the tick."""
-        self._command = np.zeros((4, n))
-        self._motor_rows = np.zeros((tick.MOTOR_ROWS, n))
+        for j in range(n):
+            self.plant[:, j] = self._plant(j)[:, 0]
+            self.gains[:, j] = _gains(flight, self._parameters[j])
+            self.sigma[:, j] = self._sigma(j)
         largest = flight.airframe.max_rotor_speed_rad_s
         self.motors = [
             MotorFailures(failures[j], seed, self.dt_s, largest, self._motor_rows[:, j], vehicle)
@@ -130,25 +148,23 @@ class Simulation:
             for j in range(n):
                 self._measure(j)
         self._warm_up()
+        self._present()
 
     def set_demand(self, j: int, setpoint: Setpoint | None) -> None:
         """What vehicle `j`'s inner loops follow during the next tick; None stops its rotors."""
-        demand = self.demand
-        if setpoint is None:
-            demand[tick.KIND, j] = tick.STOPPED
-            return
-        demand[tick.THRUST, j] = setpoint.thrust
         if isinstance(setpoint, AttitudeSetpoint):
-            demand[tick.KIND, j] = tick.ATTITUDE_KIND
-            demand[tick.ATTITUDE : tick.ATTITUDE + 4, j] = setpoint.attitude
-            demand[tick.YAW_RATE, j] = setpoint.yaw_rate_rad_s
+            kind, attitude, rate, torque = tick.ATTITUDE_KIND, setpoint.attitude, _NOTHING, _NOTHING
+            yaw_rate = setpoint.yaw_rate_rad_s
+        elif setpoint is None:
+            self.demand[tick.KIND, j] = tick.STOPPED
+            return
         elif isinstance(setpoint, RateSetpoint):
-            demand[tick.KIND, j] = tick.RATE_KIND
-            demand[tick.RATE : tick.RATE + 3, j] = setpoint.omega_flu_rad_s
-            demand[tick.YAW_RATE, j] = nan
+            kind, attitude, rate, torque = tick.RATE_KIND, _LEVEL, setpoint.omega_flu_rad_s, _NOTHING
+            yaw_rate = nan
         else:
-            demand[tick.KIND, j] = tick.TORQUE_KIND
-            demand[tick.TORQUE : tick.TORQUE + 3, j] = setpoint.torque
+            kind, attitude, rate, torque = tick.TORQUE_KIND, _LEVEL, _NOTHING, setpoint.torque
+            yaw_rate = nan
+        _PACK_DEMAND(self._asked_bytes, j * _DEMAND_BYTES, kind, *attitude, *rate, *torque, setpoint.thrust, yaw_rate)
 
     @property
     def estimator_status(self) -> EstimatorStatus:
@@ -268,36 +284,46 @@ class Simulation:
 
         `flight_time_s`, of all or (n,) each one's: since the release, negative before it; gusts go by it.
         """
-        row = self._tick % BLOCK_TICKS
-        if self._tick:
-            self._wind_normals.go_on(row)
-            self._sensor_normals.go_on(row)
-        self._velocity[:] = self.x[3:6]
+        number = self._tick
+        if number:
+            row = number % BLOCK_TICKS
+            if row in self._wind_normals.due:
+                self._wind_normals.go_on(row)
+            if row in self._sensor_normals.due:
+                self._sensor_normals.go_on(row)
         self._flight_time_s[:] = flight_time_s
-        self._tick += 1
-        field = self.field
         for j, motors in enumerate(self.motors):
             if motors.busy:
-                motors.step((self._tick - 1) * self.substeps * self.dt_s, self.x[13:17, j])
+                motors.step(number * self.substeps * self.dt_s, self.x[13:17, j])
+        self._tick = number + 1
+        field = self.field
         if self.sensed is not None:
-            self._advance_sensed(self.sensed, row)
+            self._advance_sensed(self.sensed, number)
             return
         tick.advance(
-            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._motor_rows,
-            self._command, field.state, field.coefficients, self.wind, self._wind_normals.block[row],
-            self._sensor_normals.block[row], self.sigma, self._flight_time_s, self.dt_s, self.substeps,
+            self._rows, self._asked, self.held, field.state, field.coefficients, self._wind_normals.block,
+            self._sensor_normals.block, self._log, number, self.dt_s, self.substeps,
         )  # fmt: skip
+        self.estimates = self.estimate.T.tolist()
 
-    def _advance_sensed(self, sensed: SensedEstimator, row: int) -> None:
+    def logged(self, j: int, count: int) -> tick.Array:
+        """(count, tick.LOG_WIDTH) of vehicle `j`: now, and the ticks before it, the oldest first."""
+        return self._log[np.arange(self._tick - count + 1, self._tick + 1) % BLOCK_TICKS, :, j]
+
+    def _advance_sensed(self, sensed: SensedEstimator, number: int) -> None:
         field, unit = self.field, sensed.imu
         tick.advance_sensed(
-            self.x, self.estimate, self.demand, self.gains, self.inner, self.held, self.plant, self._motor_rows,
-            self._command, field.state, field.coefficients, self.wind, self._wind_normals.block[row],
-            self._sensor_normals.block[row],
-            unit.state, unit.late, unit.settings, unit.added, *sensed.failure_kinds(),
-            self._flight_time_s, self.dt_s, self.substeps,
+            self._rows, self._asked, self.held, field.state, field.coefficients, self._wind_normals.block,
+            self._sensor_normals.block, unit.state, unit.late, unit.settings, unit.added, *sensed.failure_kinds(),
+            number, self.dt_s, self.substeps,
         )  # fmt: skip
         sensed.update(self.x, self.at_rest, self.estimate)
+        self._present()
+
+    def _present(self) -> None:
+        """The estimate as lists, and the log's row of what is now."""
+        self.estimates = self.estimate.T.tolist()
+        tick.write_log(self._rows, self._asked, self._log[self._tick % BLOCK_TICKS])
 
     def _make_sensed(self, seed: int, failures: Failures, vehicles: Sequence[int]) -> SensedEstimator:
         return SensedEstimator(self._flight, self._parameters[0], failures, seed, self.x, self.dt_s, vehicles)
@@ -328,34 +354,30 @@ class Simulation:
 
     def _warm_up(self) -> None:
         """Run each kernel once on copies, so that compiling, or reading the cache, is done before the clock runs."""
-        x, estimate, demand, inner = self.x.copy(), self.estimate.copy(), self.demand.copy(), self.inner.copy()
+        rows, asked = self._rows.copy(), self._asked.copy()
         if self.sensed is not None:
-            self._warm_up_sensed(x, estimate, demand, inner)
+            self._warm_up_sensed(rows, asked)
             return
         for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
-            demand[tick.KIND] = kind
+            asked[:, tick.KIND] = kind
             tick.advance(
-                x, estimate, demand, self.gains, inner, self.held, self.plant, self._motor_rows.copy(),
-                self._command.copy(),
-                self.field.state.copy(), self.field.coefficients, self.wind.copy(),
-                self._wind_normals.block[0], self._sensor_normals.block[0], self.sigma, self._flight_time_s, self.dt_s,
-                self.substeps,
+                rows, asked, self.held, self.field.state.copy(), self.field.coefficients, self._wind_normals.block,
+                self._sensor_normals.block, self._log.copy(), 0, self.dt_s, self.substeps,
             )  # fmt: skip
 
-    def _warm_up_sensed(self, x: tick.Array, estimate: tick.Array, demand: tick.Array, inner: tick.Array) -> None:
+    def _warm_up_sensed(self, rows: tick.Array, asked: tick.Array) -> None:
         sensed, field = self._make_sensed(0, Failures(), range(self.n)), self.field
         unit, held = sensed.imu, np.ones(self.n, dtype=np.bool_)
+        x, estimate = rows[tick.X : tick.X + tick.X_ROWS], rows[tick.ESTIMATE_AT : tick.WIND_AT]
         unit.added[:] = 0.0  # nothing that would keep it from beginning
         unit.state[imu.BIAS : imu.BIAS + 6] = 0.0
         while sensed.now_us < WARM_UP_US:
             for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
-                demand[tick.KIND] = kind
+                asked[:, tick.KIND] = kind
                 tick.advance_sensed(
-                    x, estimate, demand, self.gains, inner, held, self.plant, self._motor_rows.copy(),
-                    self._command.copy(),
-                    field.state.copy(), field.coefficients, self.wind.copy(), self._wind_normals.block[0],
-                    self._sensor_normals.block[0], unit.state, unit.late, unit.settings, unit.added, 0, 0,
-                    self._flight_time_s, self.dt_s, self.substeps,
+                    rows, asked, held, field.state.copy(), field.coefficients, self._wind_normals.block,
+                    self._sensor_normals.block, unit.state, unit.late, unit.settings, unit.added, 0, 0,
+                    0, self.dt_s, self.substeps,
                 )  # fmt: skip
             sensed.update(x, held, estimate)
 
@@ -364,6 +386,7 @@ class Simulation:
         normals = self._sensor_generators[j].standard_normal(tick.MEASURE_NORMALS)[:, None]
         tick.measure(self.x[:, j : j + 1].copy(), self.sigma[:, j : j + 1].copy(), normals, estimate)
         self.estimate[:, j] = estimate[:, 0]
+        self.estimates = self.estimate.T.tolist()
 
 
 class _Normals:
@@ -372,16 +395,16 @@ class _Normals:
 
     Attributes:
         block: (BLOCK_TICKS, rows, n), a row of it for each tick.
+        due: by tick of a block, who draws then: the first for this block, at its beginning, the others for the next.
     """
 
     def __init__(self, draw: Callable[[int, tick.Array], None], n: int, count: int) -> None:
         """`draw(each, steps)` fills what is `each`'s, of `count`, in steps (BLOCK_TICKS, steps a tick, rows, n)."""
         self._draw = draw
         self._n, self._count = n, count
-        self._due: dict[int, list[int]] = {}
-        """By tick of a block, who draws then: the first for this block, at its beginning, the others for the next."""
+        self.due: dict[int, list[int]] = {}
         for each in range(count):
-            self._due.setdefault(BLOCK_TICKS * each // count, []).append(each)
+            self.due.setdefault(BLOCK_TICKS * each // count, []).append(each)
         self._now = self._next = np.zeros((0, 0, 0, n))
         self._ahead: set[int] = set()
         """Those that have drawn for the next block."""
@@ -410,12 +433,12 @@ class _Normals:
             self._draw(each, self._next)
 
     def go_on(self, row: int) -> None:
-        """Before tick `row` of a block; not before the first of all."""
+        """Before tick `row` of a block, one that is in `due`; not before the first of all."""
         if row == 0:
             self._now, self._next = self._next, self._now
             self._ahead.clear()
             self._show()
-        for each in self._due.get(row, ()):
+        for each in self.due[row]:
             if row:
                 self._ahead.add(each)
             self._draw(each, self._next if row else self._now)

@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from mavsitl.compiled import compiled
 from mavsitl.control.allocation import allocate
 from mavsitl_vehicle.autopilot.attitude import attitude_error, quaternion_product
+from mavsitl_vehicle.plant.parameters import N_PARAMETERS
 from mavsitl_vehicle.plant.step import rk4_step
 from mavsitl_vehicle.sensors import imu
 from mavsitl_vehicle.wind.field import wind_step
 
 Array = NDArray[np.float64]
 
-# Rows of `demand`, what the autopilot asks of the inner loops (DEMAND_ROWS, n).
+# Rows of `demand` (DEMAND_ROWS, n), what the autopilots ask of the inner loops. It lies in memory vehicle by vehicle,
+# which `asked` (n, DEMAND_ROWS) is: each packs its own in one call.
 KIND = 0
 ATTITUDE = 1  # 1:5, quaternion FLU -> NWU
 RATE = 5  # 5:8, rad/s FLU; NaN: keep the present rate
@@ -63,6 +65,30 @@ FIXED_SPEED = 4  # 4:8, rad/s whatever is commanded; NaN: as commanded
 FOLLOW = 8  # 8:12, share of the way to the command that is gone in a physics step; 1: all of it
 COMMANDED = 12  # 12:16, filled in: the allocation's speeds, rad/s
 MOTOR_ROWS = 16
+
+# Blocks of rows of `rows` (ROWS, n), all that the physics and the inner loops keep: one array is one argument.
+X = 0  # 0:17, the truth: position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s, rotor speeds rad/s
+X_ROWS = 17
+ESTIMATE_AT = X + X_ROWS
+WIND_AT = ESTIMATE_AT + ESTIMATE_ROWS  # 3, m/s NWU
+INNER_AT = WIND_AT + 3
+MOTORS_AT = INNER_AT + INNER_ROWS
+COMMAND_AT = MOTORS_AT + MOTOR_ROWS  # 4, rotor speeds rad/s
+VELOCITY_AT = COMMAND_AT + 4  # 3, the truth's at the beginning of the tick
+TIME_AT = VELOCITY_AT + 3  # flight's time at the beginning of the tick, s; by which gusts go
+GAINS_AT = TIME_AT + 1
+SIGMA_AT = GAINS_AT + GAIN_ROWS  # 4, noise of position m, velocity m/s, attitude rad, rate rad/s
+PLANT_AT = SIGMA_AT + 4
+ROWS = PLANT_AT + N_PARAMETERS
+
+# Columns of a row of the log.
+LOG_TRUTH = 0  # 0:17
+LOG_ESTIMATE = 17  # 17:30
+LOG_WIND = 30  # 30:33
+LOG_RATE_SETPOINT = 33  # 33:36
+LOG_SATURATED = 36
+LOG_THRUST = 37
+LOG_WIDTH = 38
 
 
 @compiled
@@ -202,62 +228,72 @@ def outer_loop(demand: Array, estimate: Array, gains: Array, inner: Array) -> No
 
 
 @compiled
+def write_log(rows: Array, asked: Array, row: Array) -> None:
+    """Fill `row` (LOG_WIDTH, n) of the log with what is now."""
+    for i in range(LOG_RATE_SETPOINT):  # truth, estimate and wind stand one after the other in both
+        for j in range(row.shape[1]):
+            row[i, j] = rows[i, j]
+    for i in range(RATE_SETPOINT, INNER_ROWS):
+        for j in range(row.shape[1]):
+            row[LOG_RATE_SETPOINT + i - RATE_SETPOINT, j] = rows[INNER_AT + i, j]
+    for j in range(row.shape[1]):
+        row[LOG_THRUST, j] = asked[j, THRUST]
+
+
+@compiled
 def advance(
-    x: Array,
-    estimate: Array,
-    demand: Array,
-    gains: Array,
-    inner: Array,
+    rows: Array,
+    asked: Array,
     held: NDArray[np.bool_],
-    plant: Array,
-    motors: Array,
-    command: Array,
     wind_state: Array,
     wind_coefficients: Array,
-    wind: Array,
     wind_normals: Array,
     sensor_normals: Array,
-    sigma: Array,
-    time_s: Array,
+    log: Array,
+    tick: int,
     dt_s: float,
     substeps: int,
 ) -> None:
-    """One tick of `substeps` physics steps from `time_s` (n,) on, in place.
+    """Tick number `tick` from 0: `substeps` physics steps, the noise of the estimate, and a row of the log; in place.
 
-    `wind_normals` (substeps * normals_per_step, n) and `sensor_normals` (substeps * 3 + 12, n) are consumed in order.
+    `rows` (ROWS, n), `asked` (n, DEMAND_ROWS) the demands, `log` (k, LOG_WIDTH, n), of which row (tick + 1) % k is
+    filled. Of `wind_normals` (m, substeps * normals_per_step, n) and `sensor_normals` (m, substeps * 3 + 12, n) the
+    rows tick % m are consumed in order.
     """
+    x, estimate, wind = rows[X : X + X_ROWS], rows[ESTIMATE_AT:WIND_AT], rows[WIND_AT:INNER_AT]
+    inner, motors, command = rows[INNER_AT:MOTORS_AT], rows[MOTORS_AT:COMMAND_AT], rows[COMMAND_AT:VELOCITY_AT]
+    gains, sigma, plant = rows[GAINS_AT:SIGMA_AT], rows[SIGMA_AT:PLANT_AT], rows[PLANT_AT:ROWS]
+    demand = asked.T
+    n = x.shape[1]
+    for i in range(3):
+        for j in range(n):
+            rows[VELOCITY_AT + i, j] = x[3 + i, j]
     outer_loop(demand, estimate, gains, inner)
-    gyro = np.empty((3, x.shape[1]))
-    now_s = np.empty(x.shape[1])
-    per_step = wind_normals.shape[0] // substeps
+    gyro = np.empty((3, n))
+    now_s = np.empty(n)
+    winds, noise = wind_normals[tick % wind_normals.shape[0]], sensor_normals[tick % sensor_normals.shape[0]]
+    per_step = winds.shape[0] // substeps
     for k in range(substeps):
-        normals = wind_normals[k * per_step : (k + 1) * per_step]
-        for j in range(x.shape[1]):
-            now_s[j] = time_s[j] + k * dt_s
-        wind_step(wind_state, wind_coefficients, normals, now_s, wind)
-        for j in range(x.shape[1]):
+        for j in range(n):
+            now_s[j] = rows[TIME_AT, j] + k * dt_s
+        wind_step(wind_state, wind_coefficients, winds[k * per_step : (k + 1) * per_step], now_s, wind)
+        for j in range(n):
             for i in range(3):
-                gyro[i, j] = x[10 + i, j] + gains[GYRO_SIGMA, j] * sensor_normals[k * GYRO_NORMALS + i, j]
+                gyro[i, j] = x[10 + i, j] + gains[GYRO_SIGMA, j] * noise[k * GYRO_NORMALS + i, j]
         inner_loops(gyro, demand, gains, inner, held, dt_s, command)
         fail_motors(x, demand, motors, command)
         rk4_step(x, command, wind, plant, dt_s, held)
-    measure(x, sigma, sensor_normals[substeps * GYRO_NORMALS :], estimate)
+    measure(x, sigma, noise[substeps * GYRO_NORMALS :], estimate)
+    write_log(rows, asked, log[(tick + 1) % log.shape[0]])
 
 
 @compiled
 def advance_sensed(
-    x: Array,
-    estimate: Array,
-    demand: Array,
-    gains: Array,
-    inner: Array,
+    rows: Array,
+    asked: Array,
     held: NDArray[np.bool_],
-    plant: Array,
-    motors: Array,
-    command: Array,
     wind_state: Array,
     wind_coefficients: Array,
-    wind: Array,
     wind_normals: Array,
     imu_normals: Array,
     imu_state: Array,
@@ -266,26 +302,34 @@ def advance_sensed(
     imu_added: Array,
     gyro_kind: int,
     accel_kind: int,
-    time_s: Array,
+    tick: int,
     dt_s: float,
     substeps: int,
 ) -> None:
-    """As `advance`, with the rate loop on the IMU's samples; `estimate` is read alone, the filter writes it.
+    """As `advance`, with the rate loop on the IMU's samples. The filter's estimate is read alone; no log is filled.
 
-    `imu_normals` (substeps * 6 + 6, n) are consumed in order; what the IMU integrated is in `imu_state`.
+    Of `imu_normals` (m, substeps * 6 + 6, n) row tick % m is consumed in order; what the IMU integrated is in
+    `imu_state`.
     """
-    outer_loop(demand, estimate, gains, inner)
+    x, estimate, wind = rows[X : X + X_ROWS], rows[ESTIMATE_AT:WIND_AT], rows[WIND_AT:INNER_AT]
+    inner, motors, command = rows[INNER_AT:MOTORS_AT], rows[MOTORS_AT:COMMAND_AT], rows[COMMAND_AT:VELOCITY_AT]
+    gains, plant = rows[GAINS_AT:SIGMA_AT], rows[PLANT_AT:ROWS]
+    demand = asked.T
     n = x.shape[1]
+    for i in range(3):
+        for j in range(n):
+            rows[VELOCITY_AT + i, j] = x[3 + i, j]
+    outer_loop(demand, estimate, gains, inner)
     gyro = np.empty((3, n))
     now_s = np.empty(n)
     before = np.empty((7, n))
-    per_step = wind_normals.shape[0] // substeps
-    imu.begin(imu_state, imu_settings, imu_normals[substeps * imu.NORMALS :])
+    winds, noise = wind_normals[tick % wind_normals.shape[0]], imu_normals[tick % imu_normals.shape[0]]
+    per_step = winds.shape[0] // substeps
+    imu.begin(imu_state, imu_settings, noise[substeps * imu.NORMALS :])
     for k in range(substeps):
-        normals = wind_normals[k * per_step : (k + 1) * per_step]
-        for j in range(x.shape[1]):
-            now_s[j] = time_s[j] + k * dt_s
-        wind_step(wind_state, wind_coefficients, normals, now_s, wind)
+        for j in range(n):
+            now_s[j] = rows[TIME_AT, j] + k * dt_s
+        wind_step(wind_state, wind_coefficients, winds[k * per_step : (k + 1) * per_step], now_s, wind)
         imu.corrected_gyro(imu_state, gyro)
         inner_loops(gyro, demand, gains, inner, held, dt_s, command)
         fail_motors(x, demand, motors, command)
@@ -295,5 +339,5 @@ def advance_sensed(
         rk4_step(x, command, wind, plant, dt_s, held)
         imu.sample(
             imu_state, imu_late, imu_settings, imu_added, gyro_kind, accel_kind, before, x,
-            imu_normals[k * imu.NORMALS : (k + 1) * imu.NORMALS], dt_s,
+            noise[k * imu.NORMALS : (k + 1) * imu.NORMALS], dt_s,
         )  # fmt: skip

@@ -114,21 +114,27 @@ class Vehicle:
         self.kept, self.failures, self.simulation, self.column = seat
         self.parameters, self.plan = self.kept.parameters, self.kept.plan
         self._signing = self.kept.signing
-        self._timeline = Timeline(flight, self.failures, lockstep=lockstep)
+        failures = Timeline(flight, self.failures, lockstep=lockstep)
         self.kept.say = lambda severity, text: self.autopilot.say(severity, text)
         self.autopilot = self._boot(0)
         self.links = LinkControl(self.parameters, self.failures, flight.scenario, lockstep=lockstep)
         self.parameters.subscribe(self._on_parameter)
         self._mishaps = Mishaps(self)
-        self._changes = ParameterTimeline(flight, self.parameters, self.warn)
+        changes = ParameterTimeline(flight, self.parameters, self.warn)
+        self._timelines: list[Timeline | ParameterTimeline] = [line for line in (failures, changes) if line]
         self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
-        self._record = Record(recorder, flight, aboard=self._seated is not None)
+        self._record = Record(recorder, flight, self.simulation, self.column, aboard=self._seated is not None)
         self._now_us = -self.period_us
+        self._held: bool | None = None
+        self._at_rest: bool | None = None
+        """What the simulation was told last; None: nothing."""
         self._running = True
         """The autopilot does, in this control period."""
         self._boot_us = 0
         """The driver's time at which the autopilot booted last."""
+        self._clock_us = 0
+        """The autopilot's clock at the last step."""
         self._done = False
         self._recorder = recorder
         self._seed = seed
@@ -176,7 +182,7 @@ class Vehicle:
             self._flight, self.system_id, self._port_names, self.parameters, _Body(simulation, j), kept.shared,
             lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures, forwards=self._forwards,
         )  # fmt: skip
-        autopilot.estimate = simulation.estimate[:, j].tolist()
+        autopilot.estimate = simulation.estimates[j]
         autopilot.estimator_status = simulation.estimator_status
         if not self._lockstep:
             autopilot.set_home_here()  # MAVSDK asks for it as soon as it hears the vehicle
@@ -246,8 +252,9 @@ class Vehicle:
         """
         if self._mishaps.stalled:
             return 0
-        now_us = max(self._now_us - self._boot_us, 0)
-        return self.autopilot.receive(port, datagram, now_us, None if at_us is None else at_us - self._boot_us)
+        if at_us is not None:
+            at_us -= self._boot_us
+        return self.autopilot.receive(port, datagram, self._clock_us, at_us)
 
     def refuse(self, port: int, excess: Excess) -> None:
         """A datagram from a link was dropped unread, for its source had used up its budget; only counted."""
@@ -271,10 +278,8 @@ class Vehicle:
         Returns the flight's time at their beginning, negative before the release.
         """
         first = self._now_us < 0
-        if self._timeline:
-            self._timeline.step(self._now_us, self.flight_time_s)
-        if self._changes:
-            self._changes.step(self._now_us, self.flight_time_s)
+        for timeline in self._timelines:
+            timeline.step(self._now_us, self.flight_time_s)
         self._now_us = now_us
         if self._chaos is not None:
             self._chaos.step(now_us, self.flight_time_s)
@@ -283,23 +288,29 @@ class Vehicle:
             self._reboot(now_us)
         autopilot, simulation, j = self.autopilot, self.simulation, self.column
         now_us -= self._boot_us
+        self._clock_us = now_us
         if first or not now_us:
             return -1.0
+        land = autopilot.land
         if running:
-            simulation.held[j] = autopilot.land.held
-            simulation.at_rest[j] = autopilot.at_rest
+            held, at_rest = land.held, autopilot.at_rest
+            if held is not self._held or at_rest is not self._at_rest:
+                simulation.held[j], simulation.at_rest[j] = self._held, self._at_rest = held, at_rest
             setpoint = autopilot.decide(now_us - self.period_us)
-            simulation.set_demand(j, self._inner_law(setpoint))
-        released_us = autopilot.land.released_us
+            if self._seated is not None:
+                setpoint = self._inner_law(self._seated, setpoint)
+            simulation.set_demand(j, setpoint)
+        released_us = land.released_us
         return -1.0 if released_us is None else (now_us - self.period_us - released_us) / 1e6
 
     def observe(self, now_us: int) -> None:
         """After the physics up to `now_us`: what the vehicle makes of it, says and logs."""
         autopilot, simulation, j = self.autopilot, self.simulation, self.column
-        now_us -= self._boot_us
         if self._running:
-            autopilot.estimate = simulation.estimate[:, j].tolist()
-            autopilot.estimator_status = simulation.estimator_status
+            now_us = self._clock_us
+            autopilot.estimate = simulation.estimates[j]
+            if simulation.sensed is not None:
+                autopilot.estimator_status = simulation.sensed.status
             if self._wind is not None:
                 estimate = np.ascontiguousarray(simulation.estimate[:, j : j + 1])
                 self._wind.update(estimate, simulation.demand[tick.THRUST, j], not autopilot.on_ground)
@@ -367,14 +378,9 @@ class Vehicle:
         """What goes out on a link: one message a datagram, or all of a tick in one (`combine`)."""
         return self.autopilot.ports[port].node.datagrams(combine=combine)
 
-    def _inner_law(self, setpoint: Setpoint | None) -> Setpoint | None:
+    def _inner_law(self, law: SeatedLaw, setpoint: Setpoint | None) -> Setpoint | None:
         """With the PIDNN aboard, an off-board attitude becomes a torque by it; all else passes."""
-        law = self._seated
-        if (
-            law is None
-            or not isinstance(setpoint, AttitudeSetpoint)
-            or self.autopilot.commander.mode is not Mode.OFFBOARD
-        ):
+        if not isinstance(setpoint, AttitudeSetpoint) or self.autopilot.commander.mode is not Mode.OFFBOARD:
             return setpoint
         if self.autopilot.land.released_us is None:
             law.reset()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, hypot, inf, isfinite, nan, radians
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from mavsitl.codec import Frame, Message
+from mavsitl.codec import Frame, Message, reader
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector
 from mavsitl.geodesy import Origin
@@ -65,6 +65,20 @@ SLOW_BATTERY_US = 20_000_000
 
 _ALL_VALID = Validity()
 
+_read_attitude_target = reader(
+    mavlink.MAVLink_set_attitude_target_message, "time_boot_ms", *setpoints.ATTITUDE_TARGET_FIELDS
+)
+
+
+class Shown(NamedTuple):
+    """The state of which each change is told at once."""
+
+    mode: Mode
+    armed: bool
+    failsafe: bool
+    landed_state: int
+    """MAV_LANDED_STATE"""
+
 
 class Body(Protocol):
     """What the autopilot reads of the simulated vehicle besides its estimate; looked at only where it is sent."""
@@ -116,7 +130,8 @@ class Autopilot:
         self.parameters = parameters
         self.body = body
         self.plan = shared.plan
-        self.commander = Commander(parameters, self.say)
+        values = self._values = parameters.values
+        self.commander = Commander(values, self.say)
         self.estimate: list[float] = [0.0] * 6 + [1.0] + [0.0] * 6
         """Position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s: what telemetry says."""
         self._status = known(scenario.noise)
@@ -127,7 +142,7 @@ class Autopilot:
         self.origin = Origin(start.latitude_deg, start.longitude_deg, start.altitude_amsl_m)
         self.home: Home | None = None
         self._home_moved = False
-        self.battery = Battery(airframe, battery_settings(parameters))
+        self.battery = Battery(airframe, battery_settings(values))
         self.setpoint: Setpoint | PositionSetpoint | None = None
         """The newest off-board one."""
         self.setpoint_us: int | None = None
@@ -147,11 +162,9 @@ class Autopilot:
         self._hover_thrust = 1.0 / airframe.thrust_to_weight
         self._gravity = airframe.gravity_m_s2
         period_s = scenario.rates.control_period_us / 1e6
-        self._position_control = PositionControl(parameters, self._gravity, self._hover_thrust, period_s)
-        self.navigator = Navigator(
-            parameters, self._gravity, period_s, MissionCourse(shared.plan, parameters, self), self._say
-        )
-        self.pilot = Pilot(parameters, self._gravity, self._hover_thrust, period_s)
+        self._position_control = PositionControl(values, self._gravity, self._hover_thrust, period_s)
+        self.navigator = Navigator(values, self._gravity, period_s, MissionCourse(shared.plan, values, self), self._say)
+        self.pilot = Pilot(values, self._gravity, self._hover_thrust, period_s)
         self.land = LandDetector(self._hover_thrust, period_s, clamped=start.clamp, knows_height=not self.has_sensors)
         self._armed_at_us = 0
         self._flown: Mode | None = None
@@ -174,13 +187,16 @@ class Autopilot:
         """When the battery was measured."""
         self._return_margin_s = inf
         self._altitude_loss = AltitudeLoss()
-        self._shown: tuple[Mode, bool, bool, int] | None = None
+        self.shown: Shown | None = None
+        """What `report` said last: the same object until that changes."""
         self._gcs_us: int | None = None
         self._links_failed = False
         self._look_us = 0
+        self._due_us = 0
+        """When the first of all that is looked at now and then is due."""
         self._commanded_us = 0
         self._housekept_us = -HOUSEKEEPING_US
-        self._plan_watch = PlanWatch(shared.plan, self.origin, parameters, lambda text: self.warn("mission", text))
+        self._plan_watch = PlanWatch(shared.plan, self.origin, values, lambda text: self.warn("mission", text))
         self._fence_breach: str | None = None
         self._forwards = forwards and len(port_names) > 1
         self._router = Router(len(port_names), (system_id, COMPONENT_ID))
@@ -221,7 +237,7 @@ class Autopilot:
                 try:
                     handler = self._handlers.get(frame.message_id)
                     if handler is not None:
-                        handler(frame.message, frame, now_us)
+                        handler(frame, now_us)
                     elif not port.receive(frame.message, (frame.system_id, frame.component_id), now_us, at_us):
                         node.counters.unsupported += 1
                 except Exception as error:
@@ -243,19 +259,23 @@ class Autopilot:
             logging.getLogger("mavsitl").error("%s", text, exc_info=error)
             self.queue_text(mavlink.MAV_SEVERITY_ERROR, text)
 
-    def _on_attitude_target(self, message: Message, frame: Frame, now_us: int) -> None:
-        self.token_us = message.time_boot_ms * 1000
-        self._take(setpoints.from_attitude_target(message), now_us)
+    def _on_attitude_target(self, frame: Frame, now_us: int) -> None:
+        fields = _read_attitude_target(frame)
+        self.token_us = fields[0] * 1000
+        self._take(setpoints.from_attitude_target(*fields[1:]), now_us)
 
-    def _on_actuator_control_target(self, message: Message, frame: Frame, now_us: int) -> None:
+    def _on_actuator_control_target(self, frame: Frame, now_us: int) -> None:
+        message = frame.message
         self.token_us = message.time_usec
         self._take(setpoints.from_actuator_control_target(message), now_us)
 
-    def _on_position_target_local_ned(self, message: Message, frame: Frame, now_us: int) -> None:
+    def _on_position_target_local_ned(self, frame: Frame, now_us: int) -> None:
+        message = frame.message
         self.token_us = message.time_boot_ms * 1000
         self._take(setpoints.from_position_target_local_ned(message, State.of(self.estimate)), now_us)
 
-    def _on_position_target_global_int(self, message: Message, frame: Frame, now_us: int) -> None:
+    def _on_position_target_global_int(self, frame: Frame, now_us: int) -> None:
+        message = frame.message
         self.token_us = message.time_boot_ms * 1000
         home = self.home_altitude_amsl_m
         self._take(setpoints.from_position_target_global_int(message, self.origin, home), now_us)
@@ -267,12 +287,13 @@ class Autopilot:
         else:
             self.setpoint, self.setpoint_us = setpoint, now_us
             if self.commander.failsafe:
-                self._look_us = now_us
+                self._look_at(now_us)
 
-    def _on_manual_control(self, message: Message, frame: Frame, now_us: int) -> None:
+    def _on_manual_control(self, frame: Frame, now_us: int) -> None:
+        message = frame.message
         if message.target not in (0, self.system_id) or self.failures.of(Unit.RC) is not Kind.OK:
             return
-        if self.parameters["COM_RC_IN_MODE"] in (0, 4):
+        if self._values["COM_RC_IN_MODE"] in (0, 4):
             return
         if self.pilot.receive(message, now_us):
             if self.pilot.kill_asked(now_us):
@@ -281,19 +302,21 @@ class Autopilot:
                 self._step_commander(now_us)
                 self.commander.request_takeover()
 
-    def _on_set_mode(self, message: Message, frame: Frame, now_us: int) -> None:
+    def _on_set_mode(self, frame: Frame, now_us: int) -> None:
         """SET_MODE (11) has no acknowledgement; PX4's main mode is in byte 2, its sub mode in byte 3 of custom_mode."""
+        message = frame.message
         if message.base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
             main_mode, sub_mode = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
             self.request_mode(modes.find(main_mode, sub_mode), f"main {main_mode} sub {sub_mode}", now_us)
         else:
             self.request_mode(modes.from_base_mode(message.base_mode), f"base mode {message.base_mode}", now_us)
 
-    def _on_heartbeat(self, message: Message, frame: Frame, now_us: int) -> None:
+    def _on_heartbeat(self, frame: Frame, now_us: int) -> None:
+        message = frame.message
         if message.type == mavlink.MAV_TYPE_GCS:
             self._gcs_us = now_us
 
-    def _on_set_origin(self, message: Message, frame: Frame, now_us: int) -> None:
+    def _on_set_origin(self, frame: Frame, now_us: int) -> None:
         """As on PX4 the origin of a vehicle with GPS is the GPS's: said, not changed."""
         self.warn("origin", "Origin refused: it is the simulator's")
 
@@ -313,7 +336,7 @@ class Autopilot:
 
     def _validity(self, status: EstimatorStatus) -> Validity:
         """As the estimator says, within COM_VEL_FS_EVH and COM_POS_FS_EPH."""
-        p, before = self.parameters, self.valid
+        p, before = self._values, self.valid
         velocity_m_s, position_m = (
             p[name] * (KNOWN_FACTOR if known_before else 1.0)
             for name, known_before in (("COM_VEL_FS_EVH", before.velocity), ("COM_POS_FS_EPH", before.position))
@@ -563,7 +586,7 @@ class Autopilot:
         return Need.ATTITUDE if isinstance(setpoint, AttitudeSetpoint) else Need.NOTHING
 
     def _lost_altitude_m(self, elapsed_s: float) -> float:
-        if not self.parameters["FD_ALT_LOSS"]:
+        if not self._values["FD_ALT_LOSS"]:
             return 0.0
         target = self.position_setpoint or PositionSetpoint()
         height_m = self._state().position_nwu_m[2]
@@ -583,12 +606,8 @@ class Autopilot:
 
     def decide(self, now_us: int) -> Setpoint | None:
         """Before the physics: step the commander, and the setpoint for the inner loops; None stops the rotors."""
-        if now_us - self._housekept_us >= HOUSEKEEPING_US:
-            self._keep_house(now_us)
-        if now_us - self._watched_us >= WATCH_US and self.commander.armed:
-            self._watch_plan(now_us)
-        if now_us >= self._look_us:
-            self._step_commander(now_us)
+        if now_us >= self._due_us or (self._flown is None and self.commander.armed):
+            self._look_around(now_us)
         commander = self.commander
         if self._flown is not None and not (commander.armed and commander.armed_at_us == self._armed_at_us):
             self._stand_down(now_us)  # also where it was disarmed and armed again since the last period
@@ -616,6 +635,22 @@ class Autopilot:
             setpoint = None
         self.attitude_setpoint = setpoint
         return setpoint
+
+    def _look_around(self, now_us: int) -> None:
+        """What is looked at now and then, where its time has come."""
+        if now_us - self._housekept_us >= HOUSEKEEPING_US:
+            self._keep_house(now_us)
+        if now_us - self._watched_us >= WATCH_US and self.commander.armed:
+            self._watch_plan(now_us)
+        if now_us >= self._look_us:
+            self._step_commander(now_us)
+        self._due_us = min(self._housekept_us + HOUSEKEEPING_US, self._look_us)
+        if self.commander.armed:
+            self._due_us = min(self._due_us, self._watched_us + WATCH_US)
+
+    def _look_at(self, now_us: int) -> None:
+        """The commander has something to look at."""
+        self._look_us = self._due_us = now_us
 
     def _follow_stream(self, now_us: int) -> Setpoint | None:
         setpoint = self.setpoint
@@ -753,12 +788,12 @@ class Autopilot:
         self._fence_breach = self._plan_watch.breach((x, y, z))
         remaining_s = self.battery.remaining_s
         self._return_margin_s = inf
-        if self.parameters["COM_FLTT_LOW_ACT"] > 0 and remaining_s is not None and not self.on_ground:
+        if self._values["COM_FLTT_LOW_ACT"] > 0 and remaining_s is not None and not self.on_ground:
             self._return_margin_s = remaining_s - self.navigator.return_time_s(self._state())
         news = (self.battery.level, self._fence_breach, self._plan_watch.mission_failure, self._return_margin_s <= 0.0)
         if news != self._news:
             self._news = news
-            self._look_us = now_us
+            self._look_at(now_us)
 
     def _refresh_plan(self) -> None:
         watch = self._plan_watch
@@ -767,13 +802,13 @@ class Autopilot:
 
     def observe(self, now_us: int) -> None:
         """After the physics, with the new estimate: is it on the ground, in the clamp, taking off, in the air?"""
-        setpoint = self.attitude_setpoint
-        took_off = self.land.update(
+        setpoint, land, commander = self.attitude_setpoint, self.land, self.commander
+        took_off = land.update(
             now_us,
             self.estimate,
             0.0 if setpoint is None else setpoint.thrust,
-            armed=self.commander.armed,
-            ready=self.commander.spooled_up(now_us),
+            armed=commander.armed,
+            ready=land.on_ground and commander.spooled_up(now_us),
             landing=self.navigator.landing,
         )
         if took_off:
@@ -781,16 +816,18 @@ class Autopilot:
 
     def report(self, now_us: int) -> None:
         """Telemetry that is due, texts, and at once what changed: HEARTBEAT, EXTENDED_SYS_STATE, HOME_POSITION."""
-        shown = (self.commander.mode, self.commander.armed, self.commander.failsafe, self.landed_state)
-        changed = self._shown is not None and shown != self._shown
-        self._shown = shown
-        texts, self._texts = self._texts, []
-        home_moved, self._home_moved = self._home_moved and not self.lockstep, False
+        changed = self._changed()
+        texts = self._texts
+        if texts:
+            self._texts = []
+        home_moved = self._home_moved
+        if home_moved:
+            self._home_moved, home_moved = False, not self.lockstep
         if self.failures.active or self._links_failed:
             self._fail_links()
         for port in self.ports:
             node = port.node
-            waiting = node.queued
+            waiting = node.queued if port.down else 0
             for text in texts:
                 node.send_message(text)
             if changed:
@@ -798,12 +835,27 @@ class Autopilot:
                 telemetry.send_extended_sys_state(self, node, now_us)
                 if not self.lockstep:
                     telemetry.send_current_mode(self, node, now_us)
-            port.step(now_us)
-            port.schedule.run(port.subject, node, now_us)
+            if now_us >= port.due_us:
+                port.step(now_us)
+            schedule = port.schedule
+            if now_us >= schedule.due_us:
+                schedule.run(port.subject, node, now_us)
             if home_moved:
                 telemetry.request(self, node, mavlink.MAVLINK_MSG_ID_HOME_POSITION, 0, now_us)
             if port.down:
                 node.lose(waiting)
+
+    def _changed(self) -> bool:
+        """Whether what is told at once is another than in the last report."""
+        before, commander = self.shown, self.commander
+        mode, armed, failsafe, landed_state = commander.mode, commander.armed, commander.failsafe, self.landed_state
+        if before is None:
+            self.shown = Shown(mode, armed, failsafe, landed_state)
+            return False
+        if before == (mode, armed, failsafe, landed_state):
+            return False
+        self.shown = Shown(mode, armed, failsafe, landed_state)
+        return True
 
     def _fail_links(self) -> None:
         """What counts on each link until the next period: an answer to the command that breaks it still goes."""

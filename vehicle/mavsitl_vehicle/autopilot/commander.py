@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 from math import inf, radians
 from operator import attrgetter
 from typing import NamedTuple
@@ -73,6 +74,7 @@ LEAVING = (Action.RETURN, Action.LAND, Action.DESCEND)
 """What COM_FAIL_ACT_T of holding may come before."""
 
 _A = Action
+_NONE = Action.NONE
 OFFBOARD_LOSS_ACTION = {
     0: _A.POSITION, 1: _A.ALTITUDE, 2: _A.STABILIZED, 3: _A.RETURN, 4: _A.LAND, 5: _A.HOLD, 6: _A.TERMINATE,
     7: _A.DISARM,
@@ -387,7 +389,10 @@ class Commander:
         return self._missing(modes.TABLE[mode].needs)
 
     def _missing(self, needs: Need) -> str | None:
-        return next((reason for need, check in _CHECKS if need in needs and (reason := check(self))), None)
+        for check in _checks_of(needs):
+            if reason := check(self):
+                return reason
+        return None
 
     def _beyond_limits(self, mode: Mode) -> str | None:
         """Why wind and flight time do not allow `mode` to be chosen; None where they do."""
@@ -423,7 +428,7 @@ class Commander:
     def _stream_refusal(self) -> str | None:
         if not self.stream_fresh():
             return self._stream_text()
-        return self._missing(self.situation.stream_needs & _ESTIMATES)
+        return self._missing(self.situation.stream_needs)
 
     def _sticks_refusal(self) -> str | None:
         return None if self.sticks_fresh() else self._sticks_text()
@@ -450,7 +455,7 @@ class Commander:
         if self._worst > _A.HOLD:
             self._delay.end()  # acting already: what comes next need not wait
         self._delaying = False
-        worst = _A.NONE
+        worst = _NONE
         remembered = bool(self._tripped or self._since_us or self._overridden)
         for tripped, row in _WATCHED:
             if tripped(self):
@@ -463,7 +468,10 @@ class Commander:
             if action > worst:
                 worst = action
         self._worst = worst
-        if worst is _A.DISARM:
+        if worst is _NONE:
+            self.mode = self.intended
+            self._acting = False
+        elif worst is _A.DISARM:
             self._disarm("failsafe")
         elif worst in ACTION_MODES:
             self.mode = ACTION_MODES[worst]
@@ -601,6 +609,11 @@ _CHECKS: tuple[tuple[Need, Callable[[Commander], str | None]], ...] = (
     (Need.STICKS, Commander._sticks_refusal),
 )
 """A need, and why it is not met; None: it is."""
+
+
+@cache
+def _checks_of(needs: Need) -> tuple[Callable[[Commander], str | None], ...]:
+    return tuple(check for need, check in _CHECKS if need in needs)
 
 
 # --- the fail-safes --------------------------------------------------------------------------------------------------

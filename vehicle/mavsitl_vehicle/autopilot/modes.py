@@ -9,6 +9,8 @@ from mavsitl.dialect import mavlink
 
 
 class Mode(Enum):
+    __hash__ = object.__hash__  # Enum's own is slow, and each member is one object
+
     MANUAL = auto()
     ALTCTL = auto()
     POSCTL = auto()

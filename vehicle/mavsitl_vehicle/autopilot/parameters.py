@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeAlias
 from zlib import crc32
 
@@ -636,6 +637,8 @@ class Parameters:
             for name, value in values.items():
                 self._defaults[name] = checked(f"{source}: " if source else "", name, value)
         self._values = dict(self._defaults)
+        self.values: Mapping[str, float] = MappingProxyType(self._values)
+        """As this object itself by name; faster to read."""
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]

@@ -113,7 +113,8 @@ class Port:
         self._commands = CommandServer(self._execute)
         self._commanded = FairBuckets(COMMANDS_HZ, COMMANDS_BURST)
         self._busy_until_us = 0
-        self._step_us = 0
+        self.due_us = 0
+        """When `step` is."""
         self._forwarded = TokenBucket(FORWARDED_HZ, FORWARDED_BURST)
         parameters = self._parameters = ParameterServer(shared.parameters, autopilot.warn_parameter)
         missions = MissionServer(shared.plan.stores, current_interval_us=None if lockstep else 1_000_000)
@@ -159,7 +160,7 @@ class Port:
         if service is None:
             return False
         self._busy_until_us = now_us + BUSY_US
-        self._step_us = now_us
+        self.due_us = now_us
         for answer in service.receive(message, sender, now_us if at_us is None else at_us):
             self.node.send_message(answer)
         return True
@@ -170,11 +171,9 @@ class Port:
             self.node.forward(bytes(frame))
 
     def step(self, now_us: int) -> None:
-        """What the services have to send by themselves."""
-        if now_us < self._step_us:
-            return
+        """What the services have to send by themselves; needed when it is due."""
         if now_us >= self._busy_until_us:
-            self._step_us = now_us + IDLE_STEP_US
+            self.due_us = now_us + IDLE_STEP_US
         for service in self._stepped:
             for message in service.step(now_us):
                 self.node.send_message(message)

@@ -118,7 +118,23 @@ class Refusal(NamedTuple):
     text: str
 
 
-def from_attitude_target(message: Any) -> Setpoint | Refusal:
+ATTITUDE_TARGET_FIELDS = tuple(
+    name
+    for name in ("type_mask", "q", "body_roll_rate", "body_pitch_rate", "body_yaw_rate", "thrust", "thrust_body")
+    if name in mavlink.MAVLink_set_attitude_target_message.fieldnames
+)
+"""Of SET_ATTITUDE_TARGET, what `from_attitude_target` takes; `thrust_body` where the dialect has it."""
+
+
+def from_attitude_target(
+    type_mask: int,
+    q: Sequence[float],
+    roll_rate: float,
+    pitch_rate: float,
+    yaw_rate: float,
+    thrust: float,
+    thrust_body: Sequence[float] | None = None,
+) -> Setpoint | Refusal:
     """SET_ATTITUDE_TARGET, PX4's reading of `type_mask`.
 
     The attitude is used unless ATTITUDE_IGNORE is set, and then a body yaw rate that is not ignored feeds its yaw
@@ -127,35 +143,31 @@ def from_attitude_target(message: Any) -> Setpoint | Refusal:
     Fields that the mask leaves out are not looked at; a used field that is not finite or beyond `LARGEST`, or a
     quaternion that is not of unit length, refuses the whole message.
     """
-    mask: int = message.type_mask
-    thrust_body = getattr(message, "thrust_body", None) if mask & THRUST_BODY_SET else None
-    if mask & THRUST_BODY_SET and thrust_body is None:
-        return Refusal("SET_ATTITUDE_TARGET refused: THRUST_BODY_SET needs thrust_body, not in this dialect")
-    use_attitude = not mask & ATTITUDE_IGNORE
-    use_rates = not mask & (ROLL_RATE_IGNORE | PITCH_RATE_IGNORE)
-    if not use_attitude and not use_rates:
-        return Refusal(f"SET_ATTITUDE_TARGET refused: type_mask {mask:#04x} leaves no setpoint")
-    if mask & THROTTLE_IGNORE:
+    if type_mask & THRUST_BODY_SET:
+        if thrust_body is None:
+            return Refusal("SET_ATTITUDE_TARGET refused: THRUST_BODY_SET needs thrust_body, not in this dialect")
+        thrust = -thrust_body[2]
+    use_attitude = not type_mask & ATTITUDE_IGNORE
+    if not use_attitude and type_mask & (ROLL_RATE_IGNORE | PITCH_RATE_IGNORE):
+        return Refusal(f"SET_ATTITUDE_TARGET refused: type_mask {type_mask:#04x} leaves no setpoint")
+    if type_mask & THROTTLE_IGNORE:
         thrust = 0.0
-    else:
-        thrust = message.thrust if thrust_body is None else -thrust_body[2]
-    yaw_rate = nan if mask & YAW_RATE_IGNORE else message.body_yaw_rate
-    if not _usable(thrust):
+    elif not abs(thrust) <= LARGEST:
         return Refusal(f"SET_ATTITUDE_TARGET refused: thrust is {thrust:g}")
-    if not mask & YAW_RATE_IGNORE and not _usable(yaw_rate):
+    if type_mask & YAW_RATE_IGNORE:
+        yaw_rate = nan
+    elif not abs(yaw_rate) <= LARGEST:
         return Refusal(f"SET_ATTITUDE_TARGET refused: body_yaw_rate is {yaw_rate:g}")
-    thrust = min(max(thrust, 0.0), 1.0)
+    thrust = 0.0 if thrust < 0.0 else 1.0 if thrust > 1.0 else thrust
     if use_attitude:
-        w, x, y, z = message.q
+        w, x, y, z = q
         norm = sqrt(w * w + x * x + y * y + z * z)
         if not abs(norm - 1.0) <= NORM_TOLERANCE:
             return Refusal(f"SET_ATTITUDE_TARGET refused: |q| is {norm:.3g}, need 1")
-        attitude = flip_quaternion(w / norm, x / norm, y / norm, z / norm)
-        return AttitudeSetpoint(attitude, -yaw_rate, thrust)
-    p, q = message.body_roll_rate, message.body_pitch_rate
-    if not _usable(p, q):
-        return Refusal(f"SET_ATTITUDE_TARGET refused: body rates are {p:g}, {q:g}")
-    return RateSetpoint(flip_vector(p, q, yaw_rate), thrust)
+        return AttitudeSetpoint(flip_quaternion(w / norm, x / norm, y / norm, z / norm), -yaw_rate, thrust)
+    if not (abs(roll_rate) <= LARGEST and abs(pitch_rate) <= LARGEST):
+        return Refusal(f"SET_ATTITUDE_TARGET refused: body rates are {roll_rate:g}, {pitch_rate:g}")
+    return RateSetpoint(flip_vector(roll_rate, pitch_rate, yaw_rate), thrust)
 
 
 def from_actuator_control_target(message: Any) -> Setpoint | Refusal:

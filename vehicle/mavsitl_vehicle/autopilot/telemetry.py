@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from heapq import heapify, heapreplace
-from math import atan2, hypot, nan, pi, sqrt
+from math import atan2, hypot, inf, nan, pi, sqrt
+from struct import Struct
 from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
 from mavsitl import __version__
@@ -100,15 +101,17 @@ class Metadata(NamedTuple):
 
 
 class Accuracy(NamedTuple):
-    """1-sigma of the estimate, and ODOMETRY's covariances (upper right triangles, row by row) made of it."""
+    """1-sigma of the estimate, and ODOMETRY's covariances made of it: upper right triangles, row by row, packed."""
 
     position_m: float
     velocity_m_s: float
-    pose_covariance: Sequence[float]
-    velocity_covariance: Sequence[float]
+    pose_covariance: bytes
+    velocity_covariance: bytes
 
 
 _DIAGONAL = (0, 6, 11, 15, 18, 20)
+_TRIANGLE = Struct("<21f")
+_FLOAT32_MAX = (2.0 - 2.0**-23) * 2.0**127
 
 
 def accuracy(status: EstimatorStatus) -> Accuracy:
@@ -119,7 +122,12 @@ def accuracy(status: EstimatorStatus) -> Accuracy:
     rates = (v, v, status.evv_m_s, status.rate_rad_s, status.rate_rad_s, status.rate_rad_s)
     for index, sigma, sigma_rate in zip(_DIAGONAL, sigmas, rates, strict=True):
         pose[index], velocity[index] = sigma * sigma, sigma_rate * sigma_rate
-    return Accuracy(h, v, pose, velocity)
+    return Accuracy(h, v, _packed(pose), _packed(velocity))
+
+
+def _packed(triangle: list[float]) -> bytes:
+    """What is beyond float32's range is infinite."""
+    return _TRIANGLE.pack(*(inf if value > _FLOAT32_MAX else value for value in triangle))
 
 
 class CommanderView(Protocol):
@@ -511,18 +519,13 @@ _BY_AUTOPILOT: int = mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT
 def send_odometry(subject: Subject, node: Node, now_us: int) -> bool:
     """PX4's frames: pose in LOCAL_NED, velocity in LOCAL_NED (child_frame_id), body rates in FRD."""
     quality = subject.accuracy
-    _send_odometry(subject.estimate, quality.pose_covariance, quality.velocity_covariance, node, now_us)
-    return True
-
-
-def _send_odometry(
-    e: Sequence[float], pose_covariance: Sequence[float], velocity_covariance: Sequence[float], node: Node, now_us: int
-) -> None:
+    x, y, z, vx, vy, vz, q0, q1, q2, q3, p, q, r = subject.estimate
     node.send(
         _ODOMETRY, now_us, _LOCAL_NED, _LOCAL_NED,
-        e[0], -e[1], -e[2], (e[6], e[7], -e[8], -e[9]), e[3], -e[4], -e[5], e[10], -e[11], -e[12],
-        pose_covariance, velocity_covariance, 0, _BY_AUTOPILOT, 100,
+        x, -y, -z, (q0, q1, -q2, -q3), vx, -vy, -vz, p, -q, -r,
+        quality.pose_covariance, quality.velocity_covariance, 0, _BY_AUTOPILOT, 100,
     )  # fmt: skip
+    return True
 
 
 def _heading_rad(q: Sequence[float]) -> float:
@@ -1085,6 +1088,7 @@ class Schedule:
     fell behind sends once and waits for the next point of its grid. The grids of the default streams begin staggered.
 
     Attributes:
+        due_us: when the first of them is.
         unsendable: messages left out because a value did not fit the wire (beyond what a float32 holds).
     """
 
@@ -1103,6 +1107,7 @@ class Schedule:
                 due_us = start_us + int(share * min(interval_us, STAGGER_US))
                 self._queue.append((due_us, order, interval_us, stream.send))
         heapify(self._queue)
+        self.due_us = self._queue[0][0]
 
     def default_us(self, message_id: int) -> int:
         """The profile's interval of a message that is served. Raises `KeyError` for others."""
@@ -1128,6 +1133,7 @@ class Schedule:
         if interval_us != NEVER:
             self._queue.append((now_us, order, interval_us, self._streams[order].send))
         heapify(self._queue)
+        self.due_us = self._queue[0][0]
 
     def run(self, subject: Subject, node: Node, now_us: int) -> None:
         """Send what is due."""
@@ -1142,3 +1148,4 @@ class Schedule:
                 send(subject, node, now_us)
             except EncodeError:
                 self.unsendable += 1
+        self.due_us = queue[0][0]
