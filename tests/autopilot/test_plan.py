@@ -613,7 +613,7 @@ class Ground:
 
     def upload(self, messages: Sequence[Any], mission_type: int = MISSION) -> int:
         answer = self.say(mavlink.MAVLink_mission_count_message(*VEHICLE, len(messages), mission_type))
-        while type(answer) is not mavlink.MAVLink_mission_ack_message:
+        while not isinstance(answer, mavlink.MAVLink_mission_ack_message):
             answer = self.say(messages[answer.seq])
         assert answer.mission_type == mission_type
         return int(answer.type)
