@@ -695,7 +695,7 @@ def _add_sweep(commands: Any) -> None:
         "--output",
         type=Path,
         metavar="DIR",
-        help="folder (default: runs/sweep-SCENARIO); what is there is gone on with",
+        help="folder (default: runs/sweep-SCENARIO); flights that it has are not flown again",
     )
     group.add_argument("--no-report", action="store_true", help="results and tables only")
     group.add_argument("--json", action="store_true", help="print the summary as JSON and nothing else")
@@ -1484,7 +1484,7 @@ def _wish(text: str, to_set: bool) -> tuple[str, float | None]:
 def _sweep(options: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from mavsitl.campaign import optional, sweep, workers
+    from mavsitl.campaign import optional, sweep
     from mavsitl.campaign.store import Journal
     from mavsitl.clock import utc_stamp
 
@@ -1493,6 +1493,7 @@ def _sweep(options: argparse.Namespace) -> int:
         raise UsageError("--jobs: not with --scheduler, whose workers are what they are")
     plan = sweep.plan(options.scenario, options.settings, options.compare, options.seeds)
     optional.need("pyarrow")  # before anything flies
+    facts = sweep.metadata(plan, "mavsitl " + shlex.join(sys.argv[1:]), utc_stamp())
     name = plan.cases[0].flight.name
     folder: Path = options.output or Path("runs") / f"sweep-{name}"
     console = Console(stderr=options.json, highlight=False)
@@ -1503,13 +1504,9 @@ def _sweep(options: argparse.Namespace) -> int:
             console.print(text, soft_wrap=True, markup=False)
         missing = len(plan.cases) - known.flown
         if missing:
-            crew = workers.Dask(options.scheduler) if options.scheduler else workers.local(
-                min(options.jobs or workers.cores(), missing)
-            )  # fmt: skip
-            with crew:
+            with _crew(options, missing) as crew:
                 _fly_missing(plan, journal, crew, known.flown, folder)
         rows = sweep.rows(plan, journal)
-    facts = sweep.metadata(plan, "mavsitl " + shlex.join(sys.argv[1:]), utc_stamp())
     results = sweep.save(plan, rows, folder, facts)
     summary = sweep.summary(plan, rows)
     page = None
@@ -1529,6 +1526,17 @@ def _sweep(options: argparse.Namespace) -> int:
         said = sorted({row.message for row in failed})
         console.print(f"{len(failed)} of {len(rows)} failed: {said[0]}", soft_wrap=True, markup=False, style="bold red")
     return EXIT_FAILED if failed else EXIT_OK
+
+
+def _crew(options: argparse.Namespace, missing: int) -> Workers:
+    from mavsitl.campaign import workers
+
+    if options.scheduler is None:
+        return workers.local(min(options.jobs or workers.cores(), missing))
+    import logging
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong comes as our own error
+    return workers.Dask(options.scheduler)
 
 
 def _told(known: Known, total: int, folder: Path) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -33,6 +34,10 @@ class Cluster:
             arguments = [self.address, "--nthreads", "1", "--no-nanny", "--local-directory", str(self._folder)]
             self.workers.append(self._start("worker", arguments))
 
+    def kill_scheduler(self) -> None:
+        self._processes[0].kill()
+        self._processes[0].wait()
+
     def close(self) -> None:
         for process in reversed(self._processes):
             process.kill()
@@ -54,6 +59,15 @@ def _content(file: Path) -> bytes:
         assert time.monotonic() < end_s, f"{file} was not written"
         time.sleep(0.02)
     return file.read_bytes()
+
+
+@pytest.fixture(autouse=True)
+def _handlers() -> Iterator[None]:
+    """`mavsitl sweep` sets signal handlers of its own."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="module")

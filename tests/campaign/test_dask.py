@@ -107,6 +107,20 @@ def test_a_task_that_kills_its_workers_is_given_up(dask: Cluster) -> None:
         assert list(crew.map(flights.square, [4])) == [(0, 16)]
 
 
+def test_a_scheduler_that_goes_is_named(tmp_path: Path) -> None:
+    made = Cluster(tmp_path)
+    try:
+        made.have(1)
+        with Dask(made.address) as crew:
+            rows = fly_all([short("hover-calm", seed) for seed in range(1, 100)], crew)
+            next(rows)
+            made.kill_scheduler()
+            with pytest.raises(WorkerError, match=rf"the Dask scheduler at {made.address} went away"):
+                list(rows)
+    finally:
+        made.close()
+
+
 def test_no_scheduler_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
