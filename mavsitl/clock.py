@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 
-__all__ = ["LatenessHistogram", "PacedClock", "SimulatedClock", "monotonic_us"]
+__all__ = ["LatenessHistogram", "PacedClock", "SimulatedClock", "monotonic_us", "processor_s"]
 
 SPIN_US = 60
 """The last stretch before a tick is waited for awake: the kernel wakes a sleeper about this much too late."""
@@ -22,6 +22,11 @@ it: far below every time-out (COM_OF_LOSS_T, 1 s), and at 50 Hz five setpoints.
 def monotonic_us() -> int:
     """Wall time of a clock that never goes back, microseconds since an arbitrary instant."""
     return time.monotonic_ns() // 1000
+
+
+def processor_s() -> float:
+    """The processor's time that this process has used, seconds."""
+    return time.process_time()
 
 
 class SimulatedClock:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from math import hypot, inf
 from pathlib import Path
-from time import process_time
 from typing import Literal, TypeAlias, TypeVar
 
 import msgspec
@@ -15,6 +14,7 @@ import msgspec
 from mavsitl import drivers, ends, wings
 from mavsitl.campaign.grid import Case, Labels, source_digest
 from mavsitl.campaign.sums import LOST_M, Six, Sums
+from mavsitl.clock import processor_s
 from mavsitl.drivers import Tap
 from mavsitl.log.tlog import WireHash
 from mavsitl.report.metrics import Rmse
@@ -94,7 +94,7 @@ class _LostError(RuntimeError):
 
 def fly(case: Case) -> Row:
     """Fly one case in this process. Whatever goes wrong in the flight is its row, not an exception."""
-    started_s = process_time()
+    started_s = processor_s()
     sums = Sums(case.flight)
     wire = WireHash()
 
@@ -105,7 +105,7 @@ def fly(case: Case) -> Row:
             rmse=sums.rmse if status == "flown" else None, largest=sums.largest, weight_range=sums.weight_range,
             message=message, left_offboard=sums.left_offboard, effort_rad_s=sums.effort_rad_s, labels=case.labels,
             scenario_digest=scenario_digest(case.flight), wire_hash=wire.hexdigest(), code=source_digest(),
-            cpu_s=process_time() - started_s,
+            cpu_s=processor_s() - started_s,
         )  # fmt: skip
 
     def watch(now_us: int) -> None:

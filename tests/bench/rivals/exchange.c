@@ -13,6 +13,7 @@
  */
 
 #include <arpa/inet.h>
+#include <errno.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -317,7 +318,8 @@ static void vehicle(int link, double seconds) {
             if (!patience--) { fprintf(stderr, "exchange: no answer\n"); exit(1); }
             (void)!send(link, w.bytes, (size_t)w.length, 0); /* again after a time-out: the other end may be starting */
             out += w.length;
-            ssize_t size;
+            ssize_t size = 0;
+            errno = 0;
             while (!answered && (size = recv(link, bytes, sizeof bytes, 0)) > 0) {
                 in += size;
                 int32_t id;
@@ -327,6 +329,7 @@ static void vehicle(int link, double seconds) {
                         answered = target.stamp_ms == (uint32_t)(tick * TICK_US / 1000);
                     }
             }
+            if (!answered && errno == ECONNREFUSED) usleep(100000); /* it has not bound its port yet */
         }
         if (!tick) { started = now_s(); out = in = 0; }
         for (int step = 0; step < SUBSTEPS; step++) {
