@@ -36,6 +36,8 @@ from tests.durability.station import Ports, Process, Station
 KEPT_AFTER_S = 0.5
 LOG_GAP_S = 1.0
 HEARTBEAT_LIMIT_S = 5.0
+BOOT_S = 0.2
+"""Within the time from the first HEARTBEAT to the first SYS_STATUS, 0.3 s."""
 KINDS = ("parameters", "mission", "files", "all at once", "boot")
 SPEEDS = ("0.5", "1", "2")
 FILES = 3
@@ -106,7 +108,7 @@ class Campaign:
         try:
             self.tally.heartbeat_s.append(station.until(lambda: "HEARTBEAT" in station.heard, what="a HEARTBEAT"))
             if kind == "boot":
-                station.run(self.random.uniform(0.0, 1.0))
+                station.run(self.random.uniform(0.0, BOOT_S))
             else:
                 station.wait_booted()
                 self.look()
