@@ -501,15 +501,7 @@ def _add_tune(commands: Any) -> None:
         "--search-seed", type=_whole(0, 2**31), default=1, metavar="N", help="of the search itself (default: 1)"
     )
     group = parser.add_argument_group("run")
-    group.add_argument("--jobs", type=_whole(1, 4096), metavar="N", help="processes (default: one for each core)")
-    group.add_argument(
-        "--scheduler", type=_scheduler, metavar="ADDRESS",
-        help="of a Dask cluster, tcp://HOST:PORT, in place of processes",
-    )  # fmt: skip
-    group.add_argument(
-        "--output", type=Path, metavar="DIR",
-        help="folder (default: runs/tune-SCENARIO); what is there is gone on with",
-    )  # fmt: skip
+    _add_run_options(group, "runs/tune-SCENARIO); what is there is gone on with")
     group.add_argument("--json", action="store_true", help="print tune.json and nothing else")
     parser.set_defaults(run=_tune)
 
@@ -729,22 +721,20 @@ def _add_sweep(commands: Any) -> None:
     )  # fmt: skip
     group.add_argument("--seeds", default="10", metavar="SEEDS", help="default: 10, which is 1 to 10")
     group = parser.add_argument_group("run")
-    group.add_argument("--jobs", type=_whole(1, 4096), metavar="N", help="processes (default: one for each core)")
-    group.add_argument(
-        "--scheduler",
-        type=_scheduler,
-        metavar="ADDRESS",
-        help="of a Dask cluster, tcp://HOST:PORT, in place of processes",
-    )
-    group.add_argument(
-        "--output",
-        type=Path,
-        metavar="DIR",
-        help="folder (default: runs/sweep-SCENARIO); flights that it has are not flown again",
-    )
+    _add_run_options(group, "runs/sweep-SCENARIO); flights that it has are not flown again")
     group.add_argument("--no-report", action="store_true", help="results and tables only")
     group.add_argument("--json", action="store_true", help="print the summary as JSON and nothing else")
     parser.set_defaults(run=_sweep)
+
+
+def _add_run_options(group: Any, default: str) -> None:
+    """Who flies a campaign, and the folder of it."""
+    group.add_argument("--jobs", type=_whole(1, 4096), metavar="N", help="processes (default: one for each core)")
+    group.add_argument(
+        "--scheduler", type=_scheduler, metavar="ADDRESS",
+        help="of a Dask cluster, tcp://HOST:PORT, in place of processes",
+    )  # fmt: skip
+    group.add_argument("--output", type=Path, metavar="DIR", help=f"folder (default: {default}")
 
 
 def _scheduler(text: str) -> str:

@@ -41,6 +41,7 @@ __all__ = [
     "parse",
     "reader",
     "renumber",
+    "target_system_offset",
 ]
 
 Message: TypeAlias = Any
@@ -663,6 +664,12 @@ def _find_kind(id_bytes: bytes) -> _Kind | None:
         return None
     kind = _kinds[id_bytes] = _Kind(message_class)
     return kind
+
+
+def target_system_offset(id_bytes: bytes) -> int | None:
+    """Of `target_system` in the payload of a message, by its three id bytes; None: it has none, or is not known."""
+    kind = _kinds.get(id_bytes) or _find_kind(id_bytes)
+    return None if kind is None or kind.target_system == _NOWHERE else kind.target_system
 
 
 def _next_magic(datagram: bytes, begin: int) -> int:

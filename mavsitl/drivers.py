@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -510,45 +510,61 @@ class RealTime:
     """Wall time that was given up by that."""
 
 
-class Intake:
-    """What comes to a vehicle in real time: each source within its budget, and only so much of it at a time.
+class Taker(Protocol):
+    """Whoever is given what comes, a vehicle or a fleet: see `RealTimeVehicleCore`."""
 
-    A datagram beyond its budget is dropped unread; `vehicle.refuse` counts it.
+    def receive(self, port: int, datagram: bytes, at_us: int | None = None) -> int: ...
+    def refuse(self, port: int, excess: Excess) -> None: ...
+
+
+class Intake:
+    """What comes to a vehicle or a fleet in real time: each source within its budget, and so much of it at a time.
+
+    A datagram beyond its budget is dropped unread; `taker.refuse` counts it.
     """
 
-    def __init__(self, vehicle: RealTimeVehicleCore, links: Sequence[Link], tap: Tap) -> None:
-        self._vehicle = vehicle
+    def __init__(self, taker: Taker, links: Sequence[Link], taps: Mapping[int, Tap]) -> None:
+        """`links` and `taps` by port."""
+        self._taker = taker
         self._links = links
-        self._tap = tap
+        self._taps = taps
         self._budgets = [InputBudget() for _ in links]
         self._queues = [FairQueue() for _ in links]
+        self._before: Collection[int] = range(len(links))
+        """Ports that were read from the last time."""
+        self.waiting: set[int] = set()
+        """Ports of which something was read and not handed over yet."""
 
-    @property
-    def waiting(self) -> bool:
-        """Something was read and not handed over yet."""
-        return any(self._queues)
-
-    def take(self, now_us: int, wall_us: int, at_us: Callable[[], int]) -> None:
-        """Read what has come and hand over up to `TAKEN` datagrams of each link.
+    def take(self, ports: Collection[int], now_us: int, wall_us: int, at_us: Callable[[], int]) -> None:
+        """Read what has come to `ports`, and hand over up to `TAKEN` datagrams of each of them and of those that wait.
 
         `now_us` is the last tick, `wall_us` any clock on which peers expire and budgets grow, whatever the simulated
         one does, and `at_us()` what the vehicle's clock shows.
         """
-        vehicle = self._vehicle
-        for port, link in enumerate(self._links):
+        taker = self._taker
+        for port in ports:
             budget, queue = self._budgets[port], self._queues[port]
-            for datagram, source in link.receive(wall_us, READ):
+            # Of ports that are read from when they are ready there is mostly one: that there is no second is not asked.
+            received = self._links[port].receive(wall_us, READ if port in self._before else 1)
+            for datagram, source in received:
                 excess = budget.take(source, wall_us)
                 if excess is None and not queue.put(datagram, source):
                     excess = Excess.SOURCE
                 if excess is not None:
-                    vehicle.refuse(port, excess)
+                    taker.refuse(port, excess)
+            if queue:
+                self.waiting.add(port)
+        self._before = ports
+        for port in sorted(self.waiting):
+            budget, queue, tap = self._budgets[port], self._queues[port], self._taps.get(port)
             for _ in range(min(TAKEN, len(queue))):
                 datagram, source = queue.get()
-                if port == 0:
-                    self._tap.hear(FROM_GROUND, now_us, datagram)
-                if vehicle.receive(port, datagram, at_us()) and link.admit(source, wall_us):
+                if tap is not None:
+                    tap.hear(FROM_GROUND, now_us, datagram)
+                if taker.receive(port, datagram, at_us()) and self._links[port].admit(source, wall_us):
                     budget.peer(source)
+            if not queue:
+                self.waiting.discard(port)
 
 
 def run_realtime_vehicle(
@@ -582,7 +598,7 @@ def run_realtime_vehicle(
         vehicle.warn(text)
         say(text)
 
-    lost = _Lost(warn)
+    lost = LostTime(warn)
 
     def send() -> None:
         for port, link in enumerate(links):
@@ -591,10 +607,11 @@ def run_realtime_vehicle(
                     tap.hear(FROM_VEHICLE, now_us, datagram)
                 link.send(datagram)
 
-    intake = Intake(vehicle, links, tap)
+    intake = Intake(vehicle, links, {0: tap})
+    ports = range(len(links))
 
     def take() -> None:
-        intake.take(now_us, monotonic_us(), clock.time_us)
+        intake.take(ports, now_us, monotonic_us(), clock.time_us)
 
     try:
         while not stop() and not (until_finished and vehicle.finished):
@@ -627,7 +644,7 @@ def run_realtime_vehicle(
     return RealTime(now_us, monotonic_us() - start_us, clock.lateness, clock.rebased, clock.lost_us)
 
 
-class _Lost:
+class LostTime:
     """Says at a bounded rate that the wall clock could not be kept."""
 
     def __init__(self, warn: Callable[[str], None]) -> None:
@@ -660,7 +677,7 @@ def run_realtime_ground(
     first: tuple[int, int] | None = None
     last = (0, 0)
     throttle = _Throttle(progress)
-    lost = _Lost(say)
+    lost = LostTime(say)
     start_us = woken_us = monotonic_us()
     lost_us = 0
     period_s = ground.period_us / 1e6

@@ -376,6 +376,26 @@ def ground_lockstep(
         link.close()
 
 
+def _open_links(links: VehicleLinks, hint: str = "") -> list[Link]:
+    """The off-board link and the ground stations'. `hint` goes on after the option that names a port."""
+    opened: list[Link] = []
+    try:
+        for port, remote, option in (
+            (links.offboard_port, links.offboard_remote, "--offboard-port N"),
+            (links.gcs_port, links.gcs_remote, "--gcs-port N"),
+        ):
+            opened.append(UdpLink((links.bind, port), remote, port_option=f"{option}{hint}", host_option="--bind HOST"))
+        if links.tcp_port is not None:
+            from mavsitl.link.tcp import TcpServerLink
+
+            opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
+    except LinkError:
+        for link in opened:
+            link.close()
+        raise
+    return opened
+
+
 def vehicle_realtime(
     flight: Flight, links: VehicleLinks, folder: Path | None, *,
     system_id: int, wing: str | None, speed: float, until_finished: bool, state: Path | None,
@@ -399,23 +419,7 @@ def vehicle_realtime(
         core.warn(text)
 
     try:
-        opened.append(
-            UdpLink(
-                (links.bind, links.offboard_port),
-                links.offboard_remote,
-                port_option="--offboard-port N",
-                host_option="--bind HOST",
-            )
-        )
-        opened.append(
-            UdpLink(
-                (links.bind, links.gcs_port), links.gcs_remote, port_option="--gcs-port N", host_option="--bind HOST"
-            )
-        )
-        if links.tcp_port is not None:
-            from mavsitl.link.tcp import TcpServerLink
-
-            opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
+        opened += _open_links(links)
         live = _LiveLinks(opened, flight, speed)
         with ExitStack() as stack:
             # A vehicle that misbehaves does so from its first word: nobody speaks for it.
@@ -522,28 +526,6 @@ def _many(build: Any, *arguments: Any, count: int, **options: Any) -> Any:
     return build(*arguments, count=count, **options)
 
 
-def _open_pair(links: VehicleLinks, hint: str) -> list[Link]:
-    """The off-board and the ground stations' link; `hint` is the option that moves all ports."""
-    opened: list[Link] = []
-    try:
-        for port, remote, option in (
-            (links.offboard_port, links.offboard_remote, "--offboard-port N"),
-            (links.gcs_port, links.gcs_remote, "--gcs-port N"),
-        ):
-            opened.append(
-                UdpLink((links.bind, port), remote, port_option=f"{option} or {hint}", host_option="--bind HOST")
-            )
-        if links.tcp_port is not None:
-            from mavsitl.link.tcp import TcpServerLink
-
-            opened.append(TcpServerLink((links.bind, links.tcp_port), port_option="--tcp-port N"))
-    except LinkError:
-        for link in opened:
-            link.close()
-        raise
-    return opened
-
-
 def fleet_realtime(
     flight: Flight, links: Sequence[VehicleLinks], folder: Path | None, *,
     count: int, system_id: int, wing: str | None, speed: float, until_finished: bool, states: Sequence[Path | None],
@@ -573,7 +555,7 @@ def fleet_realtime(
     opened: list[list[Link]] = []
     with ExitStack() as stack:
         for each in links:
-            group = _open_pair(each, "--instance I")
+            group = _open_links(each, " or --instance I")
             opened.append(group)
             stack.callback(_close_all, group)  # the list, for its elements are replaced
         folders = [_fleet_folder(folder, system_id - 1 + j) for j in range(count)]

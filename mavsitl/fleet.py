@@ -8,25 +8,32 @@ from __future__ import annotations
 
 import math
 import selectors
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 from mavsitl.clock import CATCH_UP_US, PacedClock, monotonic_us
-from mavsitl.drivers import GUARD_S, READ, TAKEN, GroundCore, LockstepError, Progress, RealTime, Tap
+from mavsitl.drivers import (
+    GUARD_S,
+    PROGRESS_INTERVAL_US,
+    GroundCore,
+    Intake,
+    LockstepError,
+    LostTime,
+    Progress,
+    RealTime,
+    Tap,
+)
 from mavsitl.keep import Keeper, Keeping
 from mavsitl.link.base import Link
-from mavsitl.link.budget import Excess, FairQueue, InputBudget
+from mavsitl.link.budget import Excess
 from mavsitl.log.tlog import Direction
 
 LOOK_S = 0.001
 """Real time: between two looks at the sockets within a control period, so that what comes is taken together."""
 TAPS = 25
 """Logs are handed to the system in as many groups, a tick each."""
-SAY_LOST_US = 5_000_000
-"""Wall clock between two warnings that real time was not kept."""
-PROGRESS_US = 100_000
 
 
 class Collision(NamedTuple):
@@ -61,48 +68,6 @@ class FleetCore(Keeping, Protocol):
     def close(self) -> None: ...
 
 
-class _Intake:
-    """What comes to the fleet's ports, each source within its budget; as `mavsitl.drivers.Intake` for one vehicle."""
-
-    def __init__(self, fleet: FleetCore, links: Sequence[Link], taps: Mapping[int, Tap]) -> None:
-        self._fleet = fleet
-        self._links = links
-        self._taps = taps
-        self._budgets = [InputBudget() for _ in links]
-        self._queues = [FairQueue() for _ in links]
-        self._before: Collection[int] = ()
-        """Ports that were ready the last time."""
-        self.waiting: set[int] = set()
-        """Ports of which something was read and not handed over yet."""
-
-    def take(self, ports: Collection[int], now_us: int, at_us: Callable[[], int]) -> None:
-        """Read these ports and hand over what they and those that wait have."""
-        wall_us = monotonic_us()
-        for port in ports:
-            budget, queue = self._budgets[port], self._queues[port]
-            # Mostly there is one: that there is no second is not asked. Where there was more it is read to the end.
-            received = self._links[port].receive(wall_us, READ if port in self._before else 1)
-            for datagram, source in received:
-                excess = budget.take(source, wall_us)
-                if excess is None and not queue.put(datagram, source):
-                    excess = Excess.SOURCE
-                if excess is not None:
-                    self._fleet.refuse(port, excess)
-            if queue:
-                self.waiting.add(port)
-        self._before = ports
-        for port in sorted(self.waiting):
-            budget, queue, tap = self._budgets[port], self._queues[port], self._taps.get(port)
-            for _ in range(min(TAKEN, len(queue))):
-                datagram, source = queue.get()
-                if tap is not None:
-                    tap.hear(Direction.FROM_GROUND, now_us, datagram)
-                if self._fleet.receive(port, datagram, at_us()) and self._links[port].admit(source, wall_us):
-                    budget.peer(source)
-            if not queue:
-                self.waiting.discard(port)
-
-
 @contextmanager
 def _selector(links: Sequence[Link]) -> Iterator[selectors.BaseSelector]:
     """Of the sockets that the links have now, each with its port."""
@@ -133,11 +98,16 @@ def run_realtime_fleet(
     vehicles are closed, and what they had to keep is on the disk.
     """
     clock = PacedClock(fleet.period_us, speed)
-    intake = _Intake(fleet, links, taps)
+    intake = Intake(fleet, links, taps)
     keeper = Keeper(fleet)
-    told_us = 0
-    said_us = progressed_us = -SAY_LOST_US
+    progressed_us = -PROGRESS_INTERVAL_US
     now_us = tick = 0
+
+    def warn(text: str) -> None:
+        fleet.warn(text)
+        say(text)
+
+    lost = LostTime(warn)
 
     def send() -> None:
         for port, datagrams in fleet.outgoing():
@@ -155,7 +125,7 @@ def run_realtime_fleet(
             whole_ms = 0 if ports or intake.waiting else max(int(limit_s * 1e3), 0)  # a selector rounds up
             ports.update(key.data for key, _ in selector.select(whole_ms * 1e-3))
             if ports or intake.waiting:
-                intake.take(ports, now_us, clock.time_us)
+                intake.take(ports, now_us, monotonic_us(), clock.time_us)
 
         clock.start()
         start_us = monotonic_us()
@@ -174,12 +144,9 @@ def run_realtime_fleet(
                 keeper.step(wall_us)
                 for tap in logs[tick % TAPS :: TAPS]:
                     tap.tick(now_us, wall_us)
-                if clock.lost_us != told_us and wall_us - said_us >= SAY_LOST_US:
-                    text = f"Suspended or overloaded: {(clock.lost_us - told_us) / 1e6:.1f} s of real time given up"
-                    told_us, said_us = clock.lost_us, wall_us
-                    fleet.warn(text)
-                    say(text)
-                if progress is not None and wall_us - progressed_us >= PROGRESS_US:
+                if clock.lost_us != lost.told_us:
+                    lost.tell(clock.lost_us, wall_us)
+                if progress is not None and wall_us - progressed_us >= PROGRESS_INTERVAL_US:
                     progressed_us = wall_us
                     progress(fleet.flight_time_s)
                 now_us = next_us
@@ -310,7 +277,7 @@ def fly_in_memory(
             return now_us
         if now_us >= last_us:
             raise LockstepError(f"the flights did not end within {max_time_s:g} s of simulated time")
-        if progress is not None and now_us - progressed_us >= PROGRESS_US:
+        if progress is not None and now_us - progressed_us >= PROGRESS_INTERVAL_US:
             progressed_us = now_us
             progress(fleet.flight_time_s)
         now_us += fleet.period_us

@@ -7,10 +7,8 @@ wherever anybody was heard, none goes back where it came from or to a link on wh
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from struct import calcsize
 
-from mavsitl.codec import SIGNATURE_BYTES, Frame
+from mavsitl.codec import SIGNATURE_BYTES, Frame, target_system_offset
 from mavsitl.dialect import mavlink
 from mavsitl.services.base import Peer
 
@@ -130,24 +128,9 @@ def _sender(datagram: bytes, begin: int) -> int:
 
 def _target(datagram: bytes, begin: int) -> int:
     if datagram[begin] == _V2:
-        body, message_id = begin + 10, int.from_bytes(datagram[begin + 7 : begin + 10], "little")
+        body, id_bytes = begin + 10, datagram[begin + 7 : begin + 10]
     else:
-        body, message_id = begin + 6, datagram[begin + 5]
-    offset = _target_offset(message_id)
+        body, id_bytes = begin + 6, bytes((datagram[begin + 5], 0, 0))
+    offset = target_system_offset(id_bytes)
     # zeros at the end of a payload are not sent
     return 0 if offset is None or offset >= datagram[begin + 1] else datagram[body + offset]
-
-
-@cache
-def _target_offset(message_id: int) -> int | None:
-    """Of `target_system` in the payload; None: the message has none, or is not known."""
-    message_class = mavlink.mavlink_map.get(message_id)
-    if message_class is None or "target_system" not in message_class.ordered_fieldnames:
-        return None
-    formats = bytes(message_class.native_format).decode().lstrip("<")
-    offset = 0
-    for name, kind, length in zip(message_class.ordered_fieldnames, formats, message_class.array_lengths, strict=True):
-        if name == "target_system":
-            return offset
-        offset += calcsize(f"<{kind}") * max(length, 1)
-    raise AssertionError("it is among the names")

@@ -7,6 +7,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mavsitl import codec
 from mavsitl.codec import Frame, encode, parse
 from mavsitl.dialect import mavlink
 from mavsitl.routing import NOBODY, by_sender, by_target
@@ -61,3 +62,12 @@ def test_what_is_after_a_cut_frame_is_nobodys() -> None:
     whole = encode(mavlink.MAVLink_param_request_list_message(7, 1), 0, 1, 1)
     assert by_target(whole + whole[:-1]) == [(7, whole), (NOBODY, whole[:-1])]
     assert by_target(b"") == []
+
+
+def test_of_unknown_messages_nothing_is_remembered() -> None:
+    """Else a peer could make a fleet keep sixteen million of them."""
+    known = dict(codec._kinds)
+    for message_id in range(0x700000, 0x700100):
+        frame = bytes((0xFD, 1, 0, 0, 0, 9, 1)) + message_id.to_bytes(3, "little") + b"\x07\0\0"
+        assert by_target(frame) == [(0, frame)]
+    assert codec._kinds == known

@@ -45,7 +45,7 @@ class Wire:
         self._remote = client()
         self.vehicle = Vehicle(flight(), NullRecorder(), seed=1, ports=("offboard", "gcs"))
         self.links = (UdpLink(), UdpLink(remote=self._remote.getsockname()))
-        self._intake = Intake(self.vehicle, self.links, Tap())
+        self._intake = Intake(self.vehicle, self.links, {0: Tap()})
         self.now_us = 0
         self.vehicle.step(0)
 
@@ -64,7 +64,7 @@ class Wire:
             if each is not None:
                 each()
             while True:  # between two ticks there is time for all that is within the budgets
-                self._intake.take(self.now_us, self.now_us, lambda: self.now_us)
+                self._intake.take(range(len(self.links)), self.now_us, self.now_us, lambda: self.now_us)
                 if not self._intake.waiting:
                     break
             self.now_us += self.vehicle.period_us
