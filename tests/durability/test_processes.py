@@ -87,8 +87,8 @@ def test_a_suspended_vehicle_neither_jumps_nor_rushes_and_says_so() -> None:
         went_on_s = monotonic()
         station.until(lambda: any("given up" in text for text in station.texts), what="the lost time")
         assert station.clock_ms() - before_ms < 1000.0 * (monotonic() - went_on_s) + 1000.0
+        assert process.end() == 0  # only then is all of what it printed certain to have been read
         assert "of real time given up" in process.printed
-        assert process.end() == 0
         assert "schedule moved" in process.printed
     finally:
         process.close()
