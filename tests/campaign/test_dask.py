@@ -10,6 +10,7 @@ from mavsitl import cli
 from mavsitl.campaign import optional, workers
 from mavsitl.campaign.errors import MissingError, WorkerError
 from mavsitl.campaign.workers import Dask, Here, fly_all
+from mavsitl.cli.common import EXIT_FAILED, EXIT_OK
 from mavsitl.pair import free_ports
 from tests.campaign import flights
 from tests.campaign.conftest import Cluster
@@ -54,7 +55,7 @@ def test_a_sweep_on_a_cluster_leaves_what_one_here_leaves(dask: Cluster, tmp_pat
     dask.have(2)
     command = ["sweep", "hover-calm", "--set", "duration_s=1", "--seeds", "3", "--no-report"]
     for name, crew in (("here", ["--jobs", "1"]), ("there", ["--scheduler", dask.address])):
-        assert cli.main([*command, *crew, "--output", str(tmp_path / name)]) == cli.EXIT_OK
+        assert cli.main([*command, *crew, "--output", str(tmp_path / name)]) == EXIT_OK
     here, there = (
         parquet.read_table(tmp_path / name / "results.parquet").drop_columns("cpu_s") for name in ("here", "there")
     )
@@ -129,7 +130,7 @@ def test_no_scheduler_is_named(
     (port,) = free_ports(1)
     address = f"tcp://127.0.0.1:{port}"
     command = ["sweep", "hover-calm", "--seeds", "1", "--output", str(tmp_path), "--scheduler", address]
-    assert cli.main(command) == cli.EXIT_FAILED
+    assert cli.main(command) == EXIT_FAILED
     assert f"no Dask scheduler answers at {address}" in capsys.readouterr().err
 
 

@@ -20,6 +20,8 @@ from mavsitl.campaign.fly import Row
 from mavsitl.campaign.grid import Case
 from mavsitl.campaign.store import Journal, columns
 from mavsitl.campaign.summary import summarize
+from mavsitl.cli.common import EXIT_FAILED, EXIT_OK, EXIT_SIGNAL, EXIT_USAGE
+from mavsitl.cli.sweep import _told
 from mavsitl.report import sweep as page
 from mavsitl.report.html import REPORT_FILE
 from mavsitl.report.run import scenario_digest
@@ -53,7 +55,7 @@ def run(folder: Path, *arguments: str) -> int:
 def test_what_is_wrong_is_named_before_anything_flies(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: Sequence[str], message: str
 ) -> None:
-    assert run(tmp_path / "new", *arguments) == cli.EXIT_USAGE
+    assert run(tmp_path / "new", *arguments) == EXIT_USAGE
     assert message in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
@@ -68,13 +70,13 @@ def test_without_pyarrow_nothing_flies(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(optional, "find_spec", lambda name: None)
-    assert run(tmp_path / "new", "--seeds", "1") == cli.EXIT_FAILED
+    assert run(tmp_path / "new", "--seeds", "1") == EXIT_FAILED
     assert "pip install 'mavsitl[sweep]'" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
 def test_a_sweep_leaves_rows_and_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str], parquet: Any) -> None:
-    assert run(tmp_path, *GRID, "--seeds", "2", "--json") == cli.EXIT_OK
+    assert run(tmp_path, *GRID, "--seeds", "2", "--json") == EXIT_OK
     said = capsys.readouterr()
     told = msgspec.json.decode(said.out)
     assert (told["flights"], told["flown"], told["lost"], told["failed"]) == (8, 8, 0, 0)
@@ -113,7 +115,7 @@ def test_the_same_again_flies_nothing_and_more_flies_the_rest(
 ) -> None:
     """Whatever a key is called: a value that was fixed and is swept now is the same flight."""
     few = ("--set", "duration_s=2", "--set", "controller.law=pid", "--no-report")
-    assert run(tmp_path, *few, "--seeds", "2") == cli.EXIT_OK
+    assert run(tmp_path, *few, "--seeds", "2") == EXIT_OK
     before = {r["key"] for r in parquet.read_table(tmp_path / sweep.RESULTS_FILE).to_pylist()}
     flown: list[int] = []
     really = fly.fly
@@ -123,9 +125,9 @@ def test_the_same_again_flies_nothing_and_more_flies_the_rest(
         return really(case)
 
     monkeypatch.setattr(fly, "fly", noted)
-    assert run(tmp_path, *few, "--seeds", "2") == cli.EXIT_OK
+    assert run(tmp_path, *few, "--seeds", "2") == EXIT_OK
     assert flown == []
-    assert run(tmp_path, "--set", "duration_s=2", "--set", "controller.law=pidnn,pid", "--seeds", "2-3") == cli.EXIT_OK
+    assert run(tmp_path, "--set", "duration_s=2", "--set", "controller.law=pidnn,pid", "--seeds", "2-3") == EXIT_OK
     assert flown == [2, 3, 3]
     assert "1 of 4 were flown before" in capsys.readouterr().out
     rows = parquet.read_table(tmp_path / sweep.RESULTS_FILE).to_pylist()
@@ -152,7 +154,7 @@ def test_other_code_and_another_scenario_are_told_apart(tmp_path: Path, monkeypa
         monkeypatch.undo()
         (tmp_path / "mine.toml").write_text('title = "Mine"\nduration_s = 3.0\n')
         assert sweep.known(plan(), journal) == (0, 0, 4)
-    told = cli._told(sweep.Known(1, 2, 3), 9, tmp_path)
+    told = _told(sweep.Known(1, 2, 3), 9, tmp_path)
     assert [text.partition(",")[0] for text in told] == [
         f"1 of 9 were flown before ({tmp_path})",
         "2 of 9 were flown before by other code",
@@ -166,7 +168,7 @@ def test_lost_and_failed_flights_are_rows(
     """A lost one is a result; one that failed by an error is one too, and says so at the end."""
     rotors = "offnominal.rotor_thrust_scale=[1,1,1,1],[0,1,1,1]"
     monkeypatch.setenv("COLUMNS", "200")
-    assert run(tmp_path, "--set", "duration_s=5", "--set", rotors, "--seeds", "1") == cli.EXIT_OK
+    assert run(tmp_path, "--set", "duration_s=5", "--set", rotors, "--seeds", "1") == EXIT_OK
     assert "0 of 1 (1 lost)" in " ".join(capsys.readouterr().out.split())
     good, lost = parquet.read_table(tmp_path / sweep.RESULTS_FILE).to_pylist()
     assert (good["status"], lost["status"], lost["rmse_position_m"]) == ("flown", "lost", None)
@@ -178,7 +180,7 @@ def test_lost_and_failed_flights_are_rows(
         raise LookupError("nobody")
 
     monkeypatch.setattr(wings, "find", find)
-    assert run(tmp_path, "--set", "duration_s=4", "--seeds", "2") == cli.EXIT_FAILED
+    assert run(tmp_path, "--set", "duration_s=4", "--seeds", "2") == EXIT_FAILED
     assert "2 of 2 failed: LookupError: nobody" in " ".join(capsys.readouterr().out.split())
     rows = parquet.read_table(tmp_path / sweep.RESULTS_FILE).to_pylist()
     assert [(r["status"], r["message"]) for r in rows] == [("failed", "LookupError: nobody")] * 2
@@ -267,7 +269,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path) -> None:
     try:
         sweeping.until(1)
         sweeping.process.send_signal(signal.SIGINT)
-        assert sweeping.process.wait(timeout=60.0) == cli.EXIT_SIGNAL + signal.SIGINT
+        assert sweeping.process.wait(timeout=60.0) == EXIT_SIGNAL + signal.SIGINT
     finally:
         sweeping.process.kill()
         sweeping.process.wait()

@@ -115,13 +115,13 @@ def test_examples_in_the_help_are_accepted_by_the_parser() -> None:
     parser = cli.build_parser()
     examples = re.findall(
         r"^  mavsitl (.+?)(?:  .*)?$",
-        cli.FLY_EXAMPLES
-        + cli.VEHICLE_EXAMPLES
-        + cli.GROUND_EXAMPLES
-        + cli.CHECK_EXAMPLES
-        + cli.LINK_EXAMPLES
-        + cli.INJECT_EXAMPLES
-        + cli.PARAM_EXAMPLES,
+        cli.fly.FLY_EXAMPLES
+        + cli.vehicle.VEHICLE_EXAMPLES
+        + cli.ground.GROUND_EXAMPLES
+        + cli.check.CHECK_EXAMPLES
+        + cli.ask.LINK_EXAMPLES
+        + cli.ask.INJECT_EXAMPLES
+        + cli.ask.PARAM_EXAMPLES,
         re.M,
     )
     assert len(examples) >= 30

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from mavsitl import cli, process, realtime
+from mavsitl.cli.common import EXIT_FAILED, EXIT_USAGE
 from mavsitl.realtime import RealTimeError, Wish
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux's own")
@@ -218,7 +219,7 @@ def test_nothing_is_asked_for_by_default(monkeypatch: pytest.MonkeyPatch) -> Non
     ],
 )
 def test_options_that_do_not_go_together(arguments: list[str], blamed: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(arguments) == cli.EXIT_USAGE
+    assert cli.main(arguments) == EXIT_USAGE
     assert blamed in capsys.readouterr().err
 
 
@@ -230,5 +231,5 @@ def test_an_end_that_may_not_says_so_before_it_opens_a_port(
     System(monkeypatch, allows=False)
     monkeypatch.setattr("mavsitl.ends.UdpLink", None)
     monkeypatch.setattr("mavsitl.ends.open_link", None)
-    assert cli.main([*arguments, "--realtime"]) == cli.EXIT_FAILED
+    assert cli.main([*arguments, "--realtime"]) == EXIT_FAILED
     assert "LimitRTPRIO=20" in capsys.readouterr().err

@@ -1,0 +1,184 @@
+"""What the commands share: exit codes, types of arguments, the scenario's options, signals."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import tomllib
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mavsitl.scenario import Flight
+
+
+PAPER_SCENARIOS = ("hover-calm", "hover-wind", "spiral-calm", "spiral-wind")
+
+SLOWEST_SPEED = 0.5
+"""Clients miss a HEARTBEAT after 3 s of wall clock."""
+
+EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
+
+EXIT_SIGNAL = 128
+"""And the signal's number, as shells say it: 130 is Ctrl-C."""
+
+
+class UsageError(ValueError):
+    """Arguments that do not go together."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal that ends the program, wherever it is."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+def interrupt(number: int, frame: Any) -> None:
+    raise Interrupted(number)
+
+
+def on_signals(handler: Callable[[int, Any], None]) -> None:
+    """Ctrl-C, the usual request to end, and the end of the terminal, unless that is ignored (nohup)."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # the last where the system has it
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
+
+
+class Formatter(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=32, width=110)
+
+
+def command(commands: Any, name: str, summary: str, description: str, epilog: str = "") -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=summary, description=description, epilog=epilog, formatter_class=Formatter
+    )
+    return parser
+
+
+def whole(least: int, most: int) -> Callable[[str], int]:
+    """The type of an option that takes a whole number within bounds."""
+
+    def read(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and least <= int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: a whole number from {least} to {most}")
+        return int(text)
+
+    return read
+
+
+def above_zero(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: a finite number above 0")
+    return value
+
+
+def not_negative(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: a finite number, 0 or more")
+    return value
+
+
+def speed_factor(text: str) -> float:
+    value = above_zero(text)
+    if value < SLOWEST_SPEED:
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: {SLOWEST_SPEED:g} or more")
+    return value
+
+
+PORT = whole(0, 65535)
+
+SYSTEM = whole(1, 255)
+
+
+def add_scenario_options(parser: argparse.ArgumentParser, *, seed: bool = True) -> None:
+    """`seed`: False for a command that flies many seeds."""
+    group = parser.add_argument_group("scenario")
+    if seed:
+        group.add_argument("--seed", type=int, metavar="N", help="seed of wind and noise (scenario key: seed)")
+    group.add_argument("--airframe", metavar="NAME", help="paper, realistic, full-coupling or a .toml file (airframe)")
+    group.add_argument("--law", choices=("pidnn", "pid"), help="attitude law (controller.law)")
+    group.add_argument("--level", choices=("attitude", "body_rate", "torque"), help="command level (controller.level)")
+    group.add_argument(
+        "--wind-information",
+        choices=("oracle", "observer", "none"),
+        help="source of W1..W3 (controller.wind_information)",
+    )
+    group.add_argument("--duration", type=float, metavar="S", help="flight time in seconds (duration_s)")
+    group.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
+        help="any key of the scenario, dotted, with a TOML value; may be repeated",
+    )  # fmt: skip
+
+
+def add_scenario(parser: argparse.ArgumentParser, what: str) -> None:
+    """The one scenario of a process that stands alone; `what` it takes from it."""
+    parser.add_argument(
+        "scenario", nargs="?", default="takeoff-hover", metavar="SCENARIO", help=f"{what} (default: takeoff-hover)"
+    )
+    add_scenario_options(parser)
+
+
+def settings_of(options: argparse.Namespace) -> list[str]:
+    """All scenario options as KEY=VALUE, the form in which they are handed on to the processes."""
+    settings = list(options.settings)
+    named = {
+        "seed": getattr(options, "seed", None), "airframe": options.airframe,
+        "controller.law": options.law, "controller.level": options.level,
+        "controller.wind_information": options.wind_information, "duration_s": options.duration,
+    }  # fmt: skip
+    for key, value in named.items():
+        if value is not None:
+            settings.append(f'{key}="{value}"' if isinstance(value, str) else f"{key}={value}")
+    return settings
+
+
+def load(name: str, settings: Sequence[str]) -> Flight:
+    from mavsitl import scenario
+
+    return scenario.load(name, overrides_of(settings))
+
+
+def overrides_of(settings: Sequence[str]) -> dict[str, Any]:
+    """What --set and the named options change. Raises `ScenarioError`."""
+    from mavsitl import scenario
+
+    overrides: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not key:
+            raise scenario.ScenarioError(f"--set {setting}: not KEY=VALUE")
+        try:
+            overrides[key.strip()] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            overrides[key.strip()] = text
+    return overrides
+
+
+def endpoint(text: str, option: str) -> tuple[str, int]:
+    from mavsitl.link.address import AddressError, parse_address
+
+    try:
+        address = parse_address(f"udpout:{text}")
+    except AddressError as error:
+        raise AddressError(f"{option} {text}: not HOST:PORT ({error})") from error
+    return address.host, address.port
+
+
+def print_json(value: Any) -> None:
+    """For a program: indented JSON of structs, dictionaries and lists, and nothing else on stdout."""
+    import msgspec
+
+    print(msgspec.json.format(msgspec.json.encode(value), indent=2).decode())

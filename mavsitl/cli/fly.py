@@ -1,0 +1,235 @@
+"""`mavsitl fly`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavsitl.cli.common import (
+    EXIT_FAILED,
+    EXIT_OK,
+    PAPER_SCENARIOS,
+    UsageError,
+    add_scenario_options,
+    command,
+    interrupt,
+    load,
+    on_signals,
+    print_json,
+    settings_of,
+)
+from mavsitl.cli.ends import COUNT, fleet_table
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
+
+    from mavsitl.report.run import FlightRecord
+    from mavsitl.scenario import Flight
+
+
+FLY_HELP = """\
+Fly scenarios: for each, a vehicle process and a ground process are started, connected over UDP on loopback, and run in
+lock-step faster than real time. Without a scenario the paper's four experiments are flown: hover and spiral, each in
+calm air and in Dryden wind.
+
+The run folder gets, for each flight, vehicle.ulg and ground.ulg (PX4's log format), link.tlog (every datagram), and for
+all together run.json and report.html, one self-contained page.
+"""
+
+FLY_EXAMPLES = """\
+examples:
+  mavsitl fly                                        the paper's four experiments
+  mavsitl fly hover-wind --law pid                   one of them with the plain PID
+  mavsitl fly my.toml --seed 7 --level attitude      a file of your own
+  mavsitl fly hover-wind --set noise.position_m=0.02 --set offnominal.mass_scale=1.3
+  mavsitl fly --in-memory                            one process, no sockets, the same bytes
+  mavsitl fly formation-spiral --count 9             nine vehicles and their controllers in one process
+"""
+
+
+def add(commands: Any) -> None:
+    parser = command(
+        commands, "fly", "fly scenarios with two processes in lock-step, and report", FLY_HELP, FLY_EXAMPLES
+    )
+    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="a shipped scenario's name or a .toml file")
+    add_scenario_options(parser)
+    group = parser.add_argument_group("run")
+    group.add_argument("--run-dir", type=Path, metavar="DIR", help="run folder (default: runs/<UTC time>)")
+    group.add_argument("--in-memory", action="store_true", help="both ends in one process, no sockets; the same bytes")
+    group.add_argument(
+        "--count", type=COUNT, metavar="N",
+        help="a formation of N vehicles, each with its controller, in one process; logs and a table, no report",
+    )  # fmt: skip
+    group.add_argument("--no-report", action="store_true", help="logs and tables only")
+    group.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
+    parser.set_defaults(run=_fly)
+
+
+def _fly(options: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from mavsitl import pair
+    from mavsitl.clock import utc_stamp
+    from mavsitl.report import run as runs
+
+    on_signals(interrupt)
+    settings = settings_of(options)
+    names = options.scenarios or list(PAPER_SCENARIOS)
+    flights = [load(name, settings) for name in names]
+    if options.count is not None:
+        return _fly_fleet(options, flights)
+    created = utc_stamp()
+    folder: Path = options.run_dir or Path("runs") / created.replace(":", "").replace("-", "")
+    console = Console(stderr=options.json)
+    records: list[FlightRecord] = []
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[said]}"), TimeElapsedColumn(),
+        console=console, disable=not console.is_terminal,
+    )  # fmt: skip
+    try:
+        with bar:
+            for index, (name, flight) in enumerate(zip(names, flights, strict=True)):
+                alone = [other.name for other in flights].count(flight.name) == 1
+                title = flight.name if alone else f"{flight.name}-{index + 1}"
+                task = bar.add_task(f"{title:20s}", total=flight.scenario.duration_s, said="starting")
+                flown = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task, pair)
+                records.append(runs.record(flight, folder=title, **flown))
+                runs.write_run(folder, runs.new_run("mavsitl " + " ".join(sys.argv[1:]), created, tuple(records)))
+    except KeyboardInterrupt:
+        console.print(f"interrupted; the logs so far are in {folder}")
+        raise
+    return _show(console, options, folder, records)
+
+
+def _fly_fleet(options: argparse.Namespace, flights: list[Flight]) -> int:
+    """A formation in memory; there is no page for one, each vehicle's logs have a folder."""
+    from rich.console import Console
+
+    from mavsitl import ends
+    from mavsitl.clock import utc_stamp
+
+    if len(flights) != 1:
+        raise UsageError(f"--count: one scenario, not {len(flights)}")
+    (flight,) = flights
+    folder: Path = options.run_dir or Path("runs") / utc_stamp().replace(":", "").replace("-", "")
+    console = Console(stderr=True)
+    with console.status(f"{flight.name}, {options.count} vehicles") as shown:
+
+        def move(time_s: float) -> None:
+            shown.update(f"{flight.name}, {options.count} vehicles: {max(time_s, 0.0):.1f} s")
+
+        outcome = ends.fleet_in_memory(
+            flight, folder / flight.name, count=options.count, report=lambda text: None, progress=move
+        )
+    if options.json:
+        event = outcome.as_event() | {"folder": str(folder)}
+        print_json(event)
+    else:
+        for line in fleet_table(outcome):
+            print(line)
+        print(f"logs: {folder}")
+    return EXIT_FAILED if outcome.lost or not outcome.finished else EXIT_OK
+
+
+def _fly_one(
+    name: str, flight: Flight, settings: list[str], folder: Path, memory: bool, bar: RichProgress, task: Any, pair: Any
+) -> dict[str, Any]:
+    """One flight; what `run.record` wants to know of it."""
+
+    def move(time_s: float) -> None:
+        bar.update(task, completed=max(time_s, 0.0), said=f"{max(time_s, 0.0):5.1f} s")
+
+    def on_event(end: str, event: dict[str, Any]) -> None:
+        if event["event"] == "progress" and end == "vehicle":
+            move(event["flight_time_s"])
+        elif event["event"] == "report":
+            bar.update(task, said=event["text"])
+
+    if memory:
+        from mavsitl import ends
+
+        outcome = ends.in_memory(flight, folder, report=lambda text: bar.update(task, said=text), progress=move)
+        if not outcome.finished and not outcome.lost:
+            raise pair.PairError(f"{flight.name}: the flight did not end as planned")
+        wire_hash, speed, lost = outcome.wire_hash, outcome.speed, outcome.lost
+        dropped, links = outcome.dropped, outcome.links
+    else:
+        result = pair.fly(name, settings, folder, on_event)
+        said, lost = result.vehicle, result.ground.get("lost", "")
+        wire_hash, speed, dropped = said["wire_hash"], said["speed"], said["dropped"]
+        links = {"link": said["link"]} if "link" in said else {}
+    if lost:
+        bar.update(task, said="lost")
+    else:
+        bar.update(task, completed=flight.scenario.duration_s, said=f"{speed:.0f} x real time")
+    return {
+        "wire_hash": wire_hash, "real_time_factor": speed, "lost": lost, "links": links, "dropped": dropped,
+    }  # fmt: skip
+
+
+def _show(console: Any, options: argparse.Namespace, folder: Path, records: list[FlightRecord]) -> int:
+    from rich.table import Table
+
+    from mavsitl.log.flight import FlightData
+    from mavsitl.report import tables
+    from mavsitl.report.metrics import rmse
+
+    results = []
+    lost = []
+    for record in records:
+        data = FlightData.from_folder(folder / record.folder, duration_s=record.duration_s)
+        rows = tables.rows(rmse(data), record.paper_case)
+        results.append((record, rows))
+        if record.lost:
+            lost.append((record, float(data.time_s[-1])))
+    if options.json:
+        _print_json(folder, results)
+    else:
+        for record, rows in results:
+            facts = (
+                f"{record.law}, {record.level}, wind information: {_loud(record.wind_information)}, seed {record.seed}"
+            )
+            console.print(f"\n[bold]{record.title}[/]  {facts}", soft_wrap=True, highlight=False)
+            table = Table()
+            for column in ("RMSE", "ours", "paper", "ours / paper"):
+                table.add_column(column, justify="left" if column == "RMSE" else "right")
+            for row in rows:
+                paper = "" if row.paper is None else tables.number(row.paper)
+                ratio = (
+                    "" if row.ratio is None or row.verdict is None else f"{row.ratio:.2f} {tables.SYMBOLS[row.verdict]}"
+                )
+                style = {"beaten": "green", "met": "green", "missed": "yellow"}.get(row.verdict or "", "")
+                table.add_row(row.state, tables.number(row.ours), paper, f"[{style}]{ratio}[/]" if style else ratio)
+            console.print(table)
+            for link in tables.link_rows(record.links):
+                console.print(f"link {link}", soft_wrap=True, highlight=False)
+    if not options.no_report:
+        from mavsitl.report.html import write_report
+
+        page = write_report(folder)
+        console.print(f"report: {page}", soft_wrap=True, highlight=False)
+    console.print(f"logs:   {folder}", soft_wrap=True, highlight=False)
+    for record, end_s in lost:
+        console.print(
+            f"[bold red]{record.name} was lost after {end_s:.1f} s:[/] {record.lost}", soft_wrap=True, highlight=False
+        )
+    return EXIT_FAILED if lost else EXIT_OK
+
+
+def _loud(source: str) -> str:
+    return "ORACLE (true wind)" if source == "oracle" else source
+
+
+def _print_json(folder: Path, results: list[Any]) -> None:
+
+    flights = [
+        {
+            "flight": record,
+            "rmse": [{"state": row.state, "ours": row.ours, "paper": row.paper, "ratio": row.ratio} for row in rows],
+        }
+        for record, rows in results
+    ]
+    print_json({"folder": str(folder), "flights": flights})

@@ -1,0 +1,100 @@
+"""`mavsitl report`, `scenarios` and `chaos`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mavsitl.cli.common import EXIT_OK, command, print_json
+
+if TYPE_CHECKING:
+    pass
+
+
+CHAOS_HELP = """\
+List what mavsitl vehicle --chaos makes the vehicle do wrong, for tests of ground stations and SDKs: acknowledgements
+that are lost, late, doubled, refused; transfers of parameters, missions and files that break; silence.
+
+A mode is written NAME[:ARGUMENT...][@PORT], for example ack-late:2.5:NAV_TAKEOFF@gcs; PORT is all, offboard or gcs.
+Arguments may be left out from the right; an empty one is the default.
+"""
+
+
+def add_report(commands: Any) -> None:
+    parser = command(
+        commands, "report", "draw the report of runs again", "Draw report.html of each run folder again, from its logs."
+    )
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run folder, with run.json in it")
+    parser.set_defaults(run=_report)
+
+
+def add_scenarios(commands: Any) -> None:
+    parser = command(
+        commands, "scenarios", "list the shipped scenarios", "List the shipped scenarios with what they fly."
+    )
+    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.set_defaults(run=_scenarios)
+
+
+def add_chaos(commands: Any) -> None:
+    parser = command(commands, "chaos", "list what a vehicle can do wrong on MAVLink", CHAOS_HELP)
+    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.set_defaults(run=_chaos)
+
+
+def _report(options: argparse.Namespace) -> int:
+    from mavsitl.report.html import write_report
+
+    for folder in options.runs:
+        print(write_report(folder))
+    return EXIT_OK
+
+
+def _scenarios(options: argparse.Namespace) -> int:
+    from mavsitl import scenario
+
+    flights = [scenario.load(name) for name in scenario.names()]
+    if options.json:
+        print_json({f.name: f.scenario for f in flights})
+        return EXIT_OK
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("scenario", "title", "airframe", "wind", "reference", "level")
+    for flight in flights:
+        s = flight.scenario
+        wind = " + ".join(str(model.__struct_config__.tag) for model in s.wind) or "calm"
+        table.add_row(
+            flight.name, s.title, s.airframe, wind, str(s.reference.__struct_config__.tag), s.controller.level
+        )
+    Console().print(table)
+    return EXIT_OK
+
+
+def _chaos(options: argparse.Namespace) -> int:
+    from mavsitl.chaos.table import TABLE
+
+    if options.json:
+        rows = [
+            {
+                "name": name, "group": row.group, "does": row.text, "mocklink": row.mocklink,
+                "arguments": [{"name": each.name, "default": each.default} for each in row.arguments],
+            }
+            for name, row in TABLE.items()
+        ]  # fmt: skip
+        print_json(rows)
+        return EXIT_OK
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    for group in dict.fromkeys(row.group for row in TABLE.values()):
+        table = Table("mode", "what goes wrong", title=group, title_justify="left", title_style="bold", expand=True)
+        table.columns[0].no_wrap = True
+        for name, row in TABLE.items():
+            if row.group == group:
+                defaults = ", ".join(f"{each.name} {each.default}" for each in row.arguments if each.default)
+                table.add_row(row.usage(name).replace("[", r"\["), row.text + (f" ({defaults})" if defaults else ""))
+        console.print(table)
+    return EXIT_OK
