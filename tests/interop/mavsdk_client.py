@@ -120,9 +120,10 @@ class Pilot:
 
     def reset(self) -> None:
         """Whatever was before: on the ground, disarmed, in Hold, home here, no plans, default parameters."""
-        if self.telemetry.armed():
-            self.action.kill()
-            self.wait("armed", lambda armed: not armed)
+        # Asked for whatever the telemetry says: what a test did last may not have come in a HEARTBEAT yet.
+        force = 21196.0
+        assert self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, force) == mavlink.MAV_RESULT_ACCEPTED
+        self.wait("armed", lambda armed: not armed)
         self.wait("landed_state", lambda state: bool(state.name == "ON_GROUND"))
         if not _level(self.wait("attitude_euler", lambda _: True)):  # as a kill in the air may leave it
             self.wait("health", lambda health: not health.is_armable)
