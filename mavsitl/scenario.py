@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import msgspec
 
 from mavsitl.airframes import Airframe, NonNegative, Positive
+from mavsitl.errors import UsageError
 
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Level: TypeAlias = Literal["attitude", "body_rate", "torque"]
@@ -27,7 +28,7 @@ Vector3: TypeAlias = tuple[float, float, float]
 MICROSECONDS_PER_SECOND = 1_000_000
 
 
-class ScenarioError(ValueError):
+class ScenarioError(UsageError):
     """The user's scenario or airframe file is wrong; the message names the file, the key and what is allowed."""
 
 

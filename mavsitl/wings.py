@@ -6,6 +6,8 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, Literal
 
+from mavsitl.errors import UsageError
+
 Group = Literal["mavsitl.vehicle", "mavsitl.ground"]
 
 BOOT_GROUP = "mavsitl.boot"
@@ -17,7 +19,7 @@ GROUND_GROUP: Group = "mavsitl.ground"
 _SHIPPED = {VEHICLE_GROUP: "quadrotor", GROUND_GROUP: "paper"}
 
 
-class WingError(LookupError):
+class WingError(UsageError, LookupError):
     """No such wing is installed; the message lists those that are."""
 
 

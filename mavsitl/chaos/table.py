@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from mavsitl.chaos import commands, files, missions, parameters, telemetry
 from mavsitl.chaos.base import Double, Ignore, Lose, Mode
 from mavsitl.dialect import mavlink
+from mavsitl.errors import UsageError
 
 __all__ = ["ALL_PORTS", "PORTS", "TABLE", "Argument", "ChaosError", "Row", "Spec", "parse"]
 
@@ -18,7 +19,7 @@ ALL_PORTS = "all"
 PORTS = (ALL_PORTS, "offboard", "gcs")
 
 
-class ChaosError(ValueError):
+class ChaosError(UsageError):
     """A mode, an argument or a port that does not exist; the message names what does."""
 
 

@@ -1,4 +1,8 @@
-"""The commands. The only place that prints: a module for each, or for those of a kind."""
+"""The command `mavsitl`, the only place that prints: a module for each of its commands, or for those of a kind.
+
+What several share: `common` (arguments, exit codes, signals), `ends` (a process that runs alone), `campaigns` (many
+flights), `screen` (what a person sees). A command's module says what is asked and what is answered; how is elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +13,9 @@ import sys
 from collections.abc import Callable, Sequence
 
 from mavsitl import __version__, process
-from mavsitl.cli import ask, check, fly, ground, lists, sweep, tune, vehicle
-from mavsitl.cli.common import EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE, Formatter, Interrupted, UsageError
+from mavsitl.cli import ask, check, fly, ground, lists, report, sweep, tune, vehicle
+from mavsitl.cli.common import EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE, Formatter, Interrupted
+from mavsitl.errors import MavsitlError
 
 DESCRIPTION = (
     "A quadrotor in Dryden wind and an off-board controller, two processes that meet on MAVLink 2 over UDP alone."
@@ -36,38 +41,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return run(options)
     except KeyboardInterrupt as interrupt:
-        print(f"mavsitl {options.command}: interrupted", file=sys.stderr)
+        _tell(options.command, "interrupted", interrupt)
         return EXIT_SIGNAL + (interrupt.number if isinstance(interrupt, Interrupted) else signal.SIGINT)
     except BrokenPipeError:
         # The reader of our output went away; point stdout elsewhere so that the interpreter's last flush is quiet.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_FAILED
-    except Exception as error:
-        code = _exit_code(error)
-        if code is None:
-            raise
-        print(f"mavsitl {options.command}: {error}", file=sys.stderr)
-        return code
+    except MavsitlError as error:
+        _tell(options.command, str(error), error)
+        return error.exit_code
 
 
-def _exit_code(error: Exception) -> int | None:
-    """Of an error whose text is for the user; None for any other. They are loaded here: most runs have none."""
-    from mavsitl.campaign.errors import CampaignError, GridError
-    from mavsitl.chaos.table import ChaosError
-    from mavsitl.ends import ExposedError
-    from mavsitl.link.address import AddressError
-    from mavsitl.link.base import LinkError
-    from mavsitl.log.errors import LogError
-    from mavsitl.pair import PairError
-    from mavsitl.realtime import RealTimeError
-    from mavsitl.report.run import RunError
-    from mavsitl.scenario import ScenarioError
-    from mavsitl.wings import WingError
-
-    if isinstance(error, (UsageError, ExposedError, ScenarioError, GridError, ChaosError, AddressError, WingError)):
-        return EXIT_USAGE
-    failed = (LinkError, LogError, PairError, RealTimeError, RunError, CampaignError)
-    return EXIT_FAILED if isinstance(error, failed) else None
+def _tell(command: str, text: str, error: BaseException) -> None:
+    """The error's text and its notes, a line each."""
+    print(f"mavsitl {command}: {text}", *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -77,7 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
     for add in (
         fly.add, vehicle.add, ground.add, check.add, ask.add_link, ask.add_inject, ask.add_param, sweep.add, tune.add,
-        lists.add_report, lists.add_scenarios, lists.add_chaos,
+        report.add, lists.add_scenarios, lists.add_chaos,
     ):  # fmt: skip
         add(commands)
     return parser

@@ -152,6 +152,8 @@ def _add_ask_options(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def _link(options: argparse.Namespace) -> int:
+    from msgspec.structs import replace
+
     from mavsitl import ends
     from mavsitl.ask import ParameterTask
     from mavsitl.link.settings import PREFIXES, initial
@@ -172,7 +174,7 @@ def _link(options: argparse.Namespace) -> int:
     if not reply.ok and reply.vehicle is not None and wanted.get("DOWN"):
         other = options.instance + (ends.OFFBOARD_PORT if options.gcs else ends.GCS_PORT)
         hint = f"an outage of the link that is spoken on has no answer; over --endpoint udpout:127.0.0.1:{other} it has"
-        reply = _replace(reply, problem=f"{reply.problem} ({hint})")
+        reply = replace(reply, problem=f"{reply.problem} ({hint})")
 
     def show() -> None:
         for option, name in LINK_OPTIONS.items():
@@ -211,6 +213,8 @@ def _inject(options: argparse.Namespace) -> int:
 def _param(options: argparse.Namespace) -> int:
     from fnmatch import fnmatchcase
 
+    from msgspec.structs import replace
+
     from mavsitl.ask import ListTask, ParameterTask
 
     if options.action == "list":
@@ -229,7 +233,7 @@ def _param(options: argparse.Namespace) -> int:
         pattern = options.names[0]
         found = {name: value for name, value in reply.parameters.items() if fnmatchcase(name, pattern)}
         problem = reply.problem or ("" if found else f"vehicle {reply.vehicle} has no parameter like {pattern!r}")
-        reply = _replace(reply, ok=not problem, parameters=found, problem=problem)
+        reply = replace(reply, ok=not problem, parameters=found, problem=problem)
 
     def show() -> None:
         for name, value in reply.parameters.items():
@@ -259,6 +263,8 @@ def _wish(text: str, to_set: bool) -> tuple[str, float | None]:
 
 def _ask(options: argparse.Namespace, task: Task, port: int | None = None) -> Reply:
     """The vehicle's answer; `port`: of loopback, plus the instance, where no endpoint is named."""
+    from msgspec.structs import replace
+
     from mavsitl import ends
     from mavsitl.link.address import parse_address
 
@@ -267,7 +273,7 @@ def _ask(options: argparse.Namespace, task: Task, port: int | None = None) -> Re
     port = ends.GCS_PORT if port is None else port
     address = parse_address(options.endpoint or f"udpout:127.0.0.1:{port + options.instance}")
     reply = ends.ask(task, address, system_id=options.system, patience_s=options.timeout)
-    return reply if reply.ok else _replace(reply, problem=f"{address}: {reply.problem}")
+    return reply if reply.ok else replace(reply, problem=f"{address}: {reply.problem}")
 
 
 def _tell(options: argparse.Namespace, reply: Reply, done: Callable[[], None]) -> int:
@@ -282,9 +288,3 @@ def _tell(options: argparse.Namespace, reply: Reply, done: Callable[[], None]) -
     if not reply.ok:
         print(f"mavsitl {options.command}: {reply.problem}", file=sys.stderr)
     return EXIT_OK if reply.ok else EXIT_FAILED
-
-
-def _replace(reply: Reply, **changes: Any) -> Reply:
-    import msgspec
-
-    return msgspec.structs.replace(reply, **changes)

@@ -65,13 +65,12 @@ def add(commands: Any) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from mavsitl import ends
+    from mavsitl.cli import screen
     from mavsitl.link.address import parse_address
 
     endpoints = None if options.listen is None else [parse_address(text) for text in options.listen]
-    console = Console(highlight=False)
+    console = screen.console()
     if options.json or not console.is_terminal:
         report = ends.check(endpoints, duration_s=options.duration_s, ask=not options.quiet)
     else:

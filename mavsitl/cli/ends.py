@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,24 +101,8 @@ class Status:
                 "dropped": outcome.dropped, **outcome.links,
             })  # fmt: skip
             return
-        print(
-            f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time; "
-            f"{outcome.frames} frames in"
-        )
-        if outcome.lost:
-            print(f"lost: {outcome.lost}")
-        if outcome.dropped:
-            print("dropped: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
-        for place, directions in outcome.links.items():
-            for direction, counts in directions.items():
-                shown = ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
-                print(f"{place} {direction}: {shown}")
-        if outcome.lateness_us is not None:
-            p50, p99 = outcome.lateness_us
-            print(
-                f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; "
-                f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
-            )
+        for line in _end_lines(outcome):
+            print(line)
 
     def end_fleet(self, outcome: FleetOutcome) -> None:
         if self._as_json:
@@ -134,10 +118,16 @@ class Status:
         sys.stdout.flush()
 
 
+def _end_lines(outcome: Outcome) -> list[str]:
+    lines = [_pace(outcome)]
+    if outcome.lost:
+        lines.append(f"lost: {outcome.lost}")
+    return [*lines, *_dropped(outcome), *_links("", outcome.links), *_lateness(outcome)]
+
+
 def fleet_table(outcome: FleetOutcome) -> list[str]:
     """For a person: each vehicle in a line, and what is of all."""
-    total = f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time"
-    lines = [f"{total}; {outcome.frames} frames in, {len(outcome.vehicles)} vehicles"]
+    lines = [f"{_pace(outcome)}, {len(outcome.vehicles)} vehicles"]
     if any(each.rms_m is not None for each in outcome.vehicles):
         lines.append(f"{'vehicle':>7} {'flown s':>8} {'rms m':>7} {'worst m':>8}  end")
         for each in outcome.vehicles:
@@ -149,20 +139,37 @@ def fleet_table(outcome: FleetOutcome) -> list[str]:
             f"collision of vehicles {collision.vehicle} and {collision.other} at t = {collision.time_s:.2f} s: "
             f"{collision.distance_m:.2f} m"
         )
-    if outcome.dropped:
-        lines.append("dropped: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
+    lines += _dropped(outcome)
     for each in outcome.vehicles:
-        for place, directions in each.link.items():
-            for direction, counts in directions.items():
-                shown = ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
-                lines.append(f"vehicle {each.system_id}, {place} {direction}: {shown}")
-    if outcome.lateness_us is not None:
-        p50, p99 = outcome.lateness_us
-        lines.append(
-            f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; "
-            f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
-        )
-    return lines
+        lines += _links(f"vehicle {each.system_id}, ", each.link)
+    return lines + _lateness(outcome)
+
+
+def _pace(outcome: Outcome | FleetOutcome) -> str:
+    flown = f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time"
+    return f"{flown}; {outcome.frames} frames in"
+
+
+def _dropped(outcome: Outcome | FleetOutcome) -> list[str]:
+    counts = ", ".join(f"{name} {count}" for name, count in outcome.dropped.items())
+    return [f"dropped: {counts}"] if counts else []
+
+
+def _links(whose: str, links: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
+    """A line for each direction of each bad link: its counts that are not 0."""
+    return [
+        f"{whose}{place} {direction}: " + ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
+        for place, directions in links.items()
+        for direction, counts in directions.items()
+    ]
+
+
+def _lateness(outcome: Outcome | FleetOutcome) -> list[str]:
+    if outcome.lateness_us is None:  # nobody is late in lock-step
+        return []
+    p50, p99 = outcome.lateness_us
+    given_up = f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
+    return [f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; {given_up}"]
 
 
 def check_effect(options: argparse.Namespace, end: str, names: Sequence[str]) -> None:

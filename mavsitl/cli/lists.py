@@ -1,16 +1,11 @@
-"""`mavsitl report`, `scenarios` and `chaos`."""
+"""`mavsitl scenarios` and `mavsitl chaos`: lists of what there is."""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mavsitl.cli.common import EXIT_OK, command, print_json
-
-if TYPE_CHECKING:
-    pass
-
 
 CHAOS_HELP = """\
 List what mavsitl vehicle --chaos makes the vehicle do wrong, for tests of ground stations and SDKs: acknowledgements
@@ -19,14 +14,6 @@ that are lost, late, doubled, refused; transfers of parameters, missions and fil
 A mode is written NAME[:ARGUMENT...][@PORT], for example ack-late:2.5:NAV_TAKEOFF@gcs; PORT is all, offboard or gcs.
 Arguments may be left out from the right; an empty one is the default.
 """
-
-
-def add_report(commands: Any) -> None:
-    parser = command(
-        commands, "report", "draw the report of runs again", "Draw report.html of each run folder again, from its logs."
-    )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run folder, with run.json in it")
-    parser.set_defaults(run=_report)
 
 
 def add_scenarios(commands: Any) -> None:
@@ -43,14 +30,6 @@ def add_chaos(commands: Any) -> None:
     parser.set_defaults(run=_chaos)
 
 
-def _report(options: argparse.Namespace) -> int:
-    from mavsitl.report.html import write_report
-
-    for folder in options.runs:
-        print(write_report(folder))
-    return EXIT_OK
-
-
 def _scenarios(options: argparse.Namespace) -> int:
     from mavsitl import scenario
 
@@ -58,8 +37,9 @@ def _scenarios(options: argparse.Namespace) -> int:
     if options.json:
         print_json({f.name: f.scenario for f in flights})
         return EXIT_OK
-    from rich.console import Console
     from rich.table import Table
+
+    from mavsitl.cli import screen
 
     table = Table("scenario", "title", "airframe", "wind", "reference", "level")
     for flight in flights:
@@ -68,7 +48,7 @@ def _scenarios(options: argparse.Namespace) -> int:
         table.add_row(
             flight.name, s.title, s.airframe, wind, str(s.reference.__struct_config__.tag), s.controller.level
         )
-    Console().print(table)
+    screen.console().print(table)
     return EXIT_OK
 
 
@@ -85,10 +65,11 @@ def _chaos(options: argparse.Namespace) -> int:
         ]  # fmt: skip
         print_json(rows)
         return EXIT_OK
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    from mavsitl.cli import screen
+
+    console = screen.console()
     for group in dict.fromkeys(row.group for row in TABLE.values()):
         table = Table("mode", "what goes wrong", title=group, title_justify="left", title_style="bold", expand=True)
         table.columns[0].no_wrap = True

@@ -1,0 +1,25 @@
+"""`mavsitl report`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mavsitl.cli.common import EXIT_OK, command
+
+
+def add(commands: Any) -> None:
+    parser = command(
+        commands, "report", "draw the report of runs again", "Draw report.html of each run folder again, from its logs."
+    )
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run folder, with run.json in it")
+    parser.set_defaults(run=_report)
+
+
+def _report(options: argparse.Namespace) -> int:
+    from mavsitl.report.html import write_report
+
+    for folder in options.runs:
+        print(write_report(folder))
+    return EXIT_OK
