@@ -13,11 +13,13 @@ from mavsitl.cli.common import (
     SYSTEM,
     UsageError,
     above_zero,
+    add_json,
     command,
     not_negative,
     print_json,
     whole,
 )
+from mavsitl.errors import did_you_mean
 
 if TYPE_CHECKING:
     from mavsitl.ask import Reply, Task
@@ -148,7 +150,7 @@ def _add_ask_options(parser: argparse.ArgumentParser, default: str) -> None:
         "--timeout", type=above_zero, default=ANSWER_S, metavar="S",
         help=f"seconds to wait for the vehicle, and for each answer (default: {ANSWER_S:g})",
     )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print the reply as JSON and nothing else")
+    add_json(parser, "the reply")
 
 
 def _link(options: argparse.Namespace) -> int:
@@ -203,7 +205,8 @@ def _inject(options: argparse.Namespace) -> int:
         if name is None:
             raise UsageError(f"{what}: missing; allowed: {', '.join(known)}")
         if name not in known:
-            raise UsageError(f"{what}: {name!r} is not allowed; allowed: {', '.join(known)}")
+            meant = did_you_mean(name, known)
+            raise UsageError(f"{what}: {name!r} is not allowed; {meant}allowed: {', '.join(known)}")
     params = (float(units[options.unit]), float(kinds[options.type]), float(options.instance))
     reply = _ask(options, ask.CommandTask(mavlink.MAV_CMD_INJECT_FAILURE, *params))
     which = f" {options.instance}" if options.instance else ""

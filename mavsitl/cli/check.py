@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from mavsitl.cli.common import EXIT_FAILED, EXIT_OK, above_zero, command, print_json
+from mavsitl.cli.common import EXIT_FAILED, EXIT_OK, above_zero, add_json, command, print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -60,7 +60,7 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="listen only: send no HEARTBEAT and ask nothing")
     parser.add_argument("--all", action="store_true", help="list every kind of message of every source")
-    parser.add_argument("--json", action="store_true", help="print the report as JSON and nothing else")
+    add_json(parser, "the report")
     parser.set_defaults(run=_check)
 
 

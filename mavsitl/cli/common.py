@@ -65,13 +65,14 @@ def leaving(note: Callable[[], str]) -> Iterator[None]:
 
 @contextmanager
 def logs_in(folder: Path | None) -> Iterator[None]:
-    """Where this ends early, the user is told of the folder, if there is something in it."""
+    """Where this ends early, the user is told of the folder if anything was written there; None: there is no folder."""
 
-    def note() -> str:
-        written = folder is not None and folder.is_dir() and any(folder.iterdir())
-        return f"logs so far: {folder}" if written else ""
+    def written() -> dict[Path, int]:
+        files = () if folder is None else folder.rglob("*")
+        return {file: file.stat().st_mtime_ns for file in files}
 
-    with leaving(note):
+    before = written()
+    with leaving(lambda: "" if written() == before else f"logs so far: {folder}"):
         yield
 
 
@@ -85,16 +86,15 @@ def command_line() -> str:
     return "mavsitl " + shlex.join(sys.argv[1:])
 
 
-class Formatter(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=32, width=110)
-
-
 def command(commands: Any, name: str, summary: str, description: str, epilog: str = "") -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=summary, description=description, epilog=epilog, formatter_class=Formatter
-    )
+    """A command of its own below `commands`: `summary` is its line in the list, the others are its help."""
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=summary, description=description, epilog=epilog)
     return parser
+
+
+def add_json(group: Any, what: str) -> None:
+    """The option of a command that prints one value for a program; `what` it is."""
+    group.add_argument("--json", action="store_true", help=f"print {what} as JSON and nothing else")
 
 
 def whole(least: int, most: int) -> Callable[[str], int]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavsitl.cli.common import Interrupted, UsageError, above_zero, on_signals, whole
+from mavsitl.cli.common import Interrupted, UsageError, above_zero, logs_in, on_signals, whole
 
 if TYPE_CHECKING:
     from mavsitl.ends import Outcome
@@ -52,15 +53,18 @@ def add_end_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--run-dir", type=Path, metavar="DIR", help="write logs there (default: none)")
     group.add_argument("--wing", metavar="NAME", help="another installed vehicle or controller, by its entry point")
     group.add_argument(
-        "--status", choices=("text", "json"), default="text", help="json: one object a line on stdout, for programs"
+        "--json", action="store_const", dest="status", const="json", help="print one JSON object a line, for programs"
     )
+    group.add_argument("--status", choices=("text", "json"), default="text", help="json: as --json")
 
 
 class Status:
     """What an end tells while it runs: lines for a person, or JSON objects for a program. Also its stop flag."""
 
-    def __init__(self, as_json: bool) -> None:
+    def __init__(self, as_json: bool, logs: Path | None = None) -> None:
+        """`logs`: the folder that they go to; None: none are written."""
         self._as_json = as_json
+        self._logs = logs
         self._signal = 0
         on_signals(self._stop)
 
@@ -88,6 +92,12 @@ class Status:
         else:
             print(text, flush=True)
 
+    def start(self, text: str) -> None:
+        """`text` is who and where; told with it is where the logs go."""
+        self.say(text)
+        if self._logs is not None:
+            self.say(f"logs: {self._logs}")
+
     def end(self, outcome: Outcome) -> None:
         if self._as_json:
             self._print({
@@ -98,18 +108,27 @@ class Status:
                     "lateness_us": outcome.lateness_us, "rebased": outcome.rebased, "lost_s": outcome.lost_s,
                 }),
                 **({"lost": outcome.lost} if outcome.lost else {}),
-                "dropped": outcome.dropped, **outcome.links,
+                "dropped": outcome.dropped, **outcome.links, **self._where(),
             })  # fmt: skip
             return
-        for line in _end_lines(outcome):
-            print(line)
+        self._tell_end(_end_lines(outcome), lost=bool(outcome.lost))
 
     def end_fleet(self, outcome: FleetOutcome) -> None:
         if self._as_json:
-            self._print(outcome.as_event())
+            self._print(outcome.as_event() | self._where())
             return
-        for line in fleet_table(outcome):
-            print(line)
+        self._tell_end(fleet_table(outcome), lost=bool(outcome.lost))
+
+    def _where(self) -> dict[str, str]:
+        return {} if self._logs is None else {"logs": f"{self._logs}"}
+
+    def _tell_end(self, lines: Sequence[str], *, lost: bool) -> None:
+        where = "" if self._logs is None else f"logs: {self._logs}"
+        if lost and not where:
+            where = "logs: none; --run-dir DIR keeps them"
+        for line in (*lines, where):
+            if line:
+                print(line)
 
     def _print(self, event: dict[str, Any]) -> None:
         import msgspec
@@ -123,6 +142,17 @@ def _end_lines(outcome: Outcome) -> list[str]:
     if outcome.lost:
         lines.append(f"lost: {outcome.lost}")
     return [*lines, *_dropped(outcome), *_links("", outcome.links), *_lateness(outcome)]
+
+
+def tells_logs(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    """Of a command with --run-dir: however it ends, the user is told what was written there."""
+
+    @wraps(run)
+    def command(options: argparse.Namespace) -> int:
+        with logs_in(options.run_dir):
+            return run(options)
+
+    return command
 
 
 def fleet_table(outcome: FleetOutcome) -> list[str]:

@@ -11,6 +11,7 @@ from mavsitl.cli.common import (
     EXIT_OK,
     PAPER_SCENARIOS,
     UsageError,
+    add_json,
     add_scenario_options,
     command,
     command_line,
@@ -67,7 +68,7 @@ def add(commands: Any) -> None:
         help="a formation of N vehicles, each with its controller, in one process; logs and a table, no report",
     )  # fmt: skip
     group.add_argument("--no-report", action="store_true", help="logs and tables only")
-    group.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
+    add_json(group, "the result")
     parser.set_defaults(run=_fly)
 
 
@@ -176,7 +177,8 @@ def _show(console: Console, options: argparse.Namespace, folder: Path, records: 
         data = FlightData.from_folder(folder / record.folder, duration_s=record.duration_s)
         results.append((record, tables.rows(rmse(data), record.paper_case)))
         if record.lost:
-            lost.append(f"{record.name} was lost after {data.time_s[-1]:.1f} s: {record.lost}")
+            said = f"{record.name} was lost after {data.time_s[-1]:.1f} s: {record.lost}"
+            lost.append(f"{said}\nlook at: mavsitl log info {folder / record.folder}")
     if options.json:
         _print_json(folder, results)
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from mavsitl.cli.common import EXIT_OK, command, print_json
+from mavsitl.cli.common import EXIT_OK, add_json, command, print_json
 
 CHAOS_HELP = """\
 List what mavsitl vehicle --chaos makes the vehicle do wrong, for tests of ground stations and SDKs: acknowledgements
@@ -20,13 +20,13 @@ def add_scenarios(commands: Any) -> None:
     parser = command(
         commands, "scenarios", "list the shipped scenarios", "List the shipped scenarios with what they fly."
     )
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    add_json(parser, "the scenarios, each with all its keys,")
     parser.set_defaults(run=_scenarios)
 
 
 def add_chaos(commands: Any) -> None:
     parser = command(commands, "chaos", "list what a vehicle can do wrong on MAVLink", CHAOS_HELP)
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    add_json(parser, "the modes")
     parser.set_defaults(run=_chaos)
 
 

@@ -11,6 +11,7 @@ from mavsitl.cli.campaigns import add_run_options, check_run_options, crew
 from mavsitl.cli.common import (
     EXIT_FAILED,
     EXIT_OK,
+    add_json,
     command,
     command_line,
     interrupt,
@@ -74,7 +75,7 @@ def add(commands: Any) -> None:
     group = parser.add_argument_group("run")
     add_run_options(group, "runs/sweep-SCENARIO; flights that it has are not flown again")
     group.add_argument("--no-report", action="store_true", help="results and tables only")
-    group.add_argument("--json", action="store_true", help="print the summary as JSON and nothing else")
+    add_json(group, "the summary")
     parser.set_defaults(run=_sweep)
 
 

@@ -12,6 +12,7 @@ from mavsitl.cli.common import (
     EXIT_OK,
     PAPER_SCENARIOS,
     above_zero,
+    add_json,
     add_scenario_options,
     command,
     command_line,
@@ -93,7 +94,7 @@ def add(commands: Any) -> None:
     )
     group = parser.add_argument_group("run")
     add_run_options(group, "runs/tune-SCENARIO; what is there is gone on with")
-    group.add_argument("--json", action="store_true", help="print tune.json and nothing else")
+    add_json(group, "what tune.json has")
     parser.set_defaults(run=_tune)
 
 
