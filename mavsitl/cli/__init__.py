@@ -86,7 +86,7 @@ def build_parser() -> Parser:
     """The whole command line; the reference page of the docs is made from it."""
     parser = Parser("mavsitl", description=DESCRIPTION, epilog=EPILOG)
     parser.add_argument("--version", action="version", version=f"mavsitl {__version__}")
-    commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
+    commands = parser.add_subparsers(title="commands", prog=parser.prog, dest="command", metavar="COMMAND")
     for add in (
         fly.add, vehicle.add, ground.add, check.add, ask.add_link, ask.add_inject, ask.add_param, sweep.add, tune.add,
         report.add, lists.add_scenarios, lists.add_chaos, completion.add,

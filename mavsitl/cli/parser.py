@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import shutil
-import textwrap
 from collections.abc import Iterator
 from itertools import groupby
 from typing import Any, NoReturn
@@ -34,7 +32,14 @@ class Formatter(argparse.RawDescriptionHelpFormatter):
     """Paragraphs are filled to the width of the terminal; indented lines, such as examples, stay lines."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=32, width=min(shutil.get_terminal_size().columns, WIDEST))
+        super().__init__(prog, max_help_position=32, width=WIDEST)
+
+    def format_help(self) -> str:
+        # The terminal is looked at here: argparse makes a formatter for each option, and most runs show no help.
+        import shutil
+
+        self._width = min(shutil.get_terminal_size().columns, WIDEST)
+        return super().format_help()
 
     def _format_action(self, action: argparse.Action) -> str:
         if not isinstance(action, argparse._SubParsersAction):
@@ -64,6 +69,8 @@ def _logical(text: str) -> Iterator[str]:
 
 
 def _wrapped(text: str, width: int) -> list[str]:
+    import textwrap
+
     return textwrap.wrap(text, width, break_on_hyphens=False, break_long_words=False)
 
 
