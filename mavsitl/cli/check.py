@@ -110,15 +110,13 @@ def _show_check(console: Console, report: Report, *, everything: bool) -> None:
 
 
 def _show_port(console: Console, port: PortReport, *, everything: bool) -> None:
-    from rich import box
-    from rich.table import Table
+    from mavsitl.cli import screen
 
     seen = f"{port.datagrams} datagrams, {port.frames} good frames" if port.datagrams else "nothing came"
     console.print(f"[bold]{port.ear.endpoint}[/]  {seen}")
     if port.heard:
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-        for name in ("from", "id", "what", "MAVLink", "rate", "lost", "answer"):
-            table.add_column(name, justify="right" if name in ("rate", "lost") else "left", no_wrap=name == "from")
+        columns = ("from", "id", "what", "MAVLink", "rate", "lost", "answer")
+        table = screen.table(*columns, right=("rate", "lost"), whole=("from",))
         for heard in port.heard:
             table.add_row(*_heard_cells(heard))
         console.print(table)
@@ -152,13 +150,12 @@ def _spoken(name: str) -> str:
 
 
 def _show_kinds(console: Console, heard: Heard, *, everything: bool) -> None:
-    from rich.table import Table
+    from mavsitl.cli import screen
 
     name = f"{heard.system_id}/{heard.component_id} at {heard.address}"
     if everything:
-        table = Table(f"messages of {name}", "id", "number", "1/s", "B/s")
-        for column in table.columns[1:]:
-            column.justify = "right"
+        numbers = ("id", "number", "1/s", "B/s")
+        table = screen.table(f"messages of {name}", *numbers, right=numbers)
         for kind in heard.kinds:
             table.add_row(kind.name, f"{kind.id}", f"{kind.messages}", f"{kind.per_s:.1f}", f"{kind.bytes_per_s:.0f}")
         console.print(table)

@@ -197,7 +197,6 @@ def _show(console: Console, options: argparse.Namespace, folder: Path, records: 
 def _show_flight(console: Console, record: FlightRecord, rows: list[Row]) -> None:
     """Its root mean square errors beside the paper's, and what its links did."""
     from rich.markup import escape
-    from rich.table import Table
 
     from mavsitl.cli import screen
     from mavsitl.report import tables
@@ -205,14 +204,14 @@ def _show_flight(console: Console, record: FlightRecord, rows: list[Row]) -> Non
     wind = "ORACLE (true wind)" if record.wind_information == "oracle" else record.wind_information
     facts = f"{record.law}, {record.level}, wind information: {wind}, seed {record.seed}"
     console.print(f"\n[bold]{escape(record.title)}[/]  {facts}", soft_wrap=True)
-    table = Table("RMSE")
-    for column in ("ours", "paper", "ours / paper"):
-        table.add_column(column, justify="right")
+    columns = ("RMSE", "ours") if record.paper_case is None else ("RMSE", "ours", "paper", "ours / paper")
+    table = screen.table(*columns, right=columns[1:])
     for row in rows:
-        paper = "" if row.paper is None else tables.number(row.paper)
-        ratio = "" if row.ratio is None or row.verdict is None else f"{row.ratio:.2f} {tables.SYMBOLS[row.verdict]}"
-        style = {"beaten": "green", "met": "green", "missed": "yellow"}.get(row.verdict or "", "")
-        table.add_row(row.state, tables.number(row.ours), paper, f"[{style}]{ratio}[/]" if style else ratio)
+        cells = [row.state, tables.number(row.ours)]
+        if row.paper is not None and row.ratio is not None and row.verdict is not None:
+            style = {"beaten": "green", "met": "green", "missed": "yellow"}[row.verdict]
+            cells += [tables.number(row.paper), f"[{style}]{row.ratio:.2f} {tables.SYMBOLS[row.verdict]}[/]"]
+        table.add_row(*cells)
     console.print(table)
     for link in tables.link_rows(record.links):
         screen.line(console, f"link {link}")

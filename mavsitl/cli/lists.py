@@ -7,6 +7,9 @@ from typing import Any
 
 from mavsitl.cli.common import EXIT_OK, add_json, command, print_json
 
+WIDE = 100
+"""Columns of a terminal from which on a scenario's command level is listed, too."""
+
 CHAOS_HELP = """\
 List what mavsitl vehicle --chaos makes the vehicle do wrong, for tests of ground stations and SDKs: acknowledgements
 that are lost, late, doubled, refused; transfers of parameters, missions and files that break; silence.
@@ -37,18 +40,19 @@ def _scenarios(options: argparse.Namespace) -> int:
     if options.json:
         print_json({f.name: f.scenario for f in flights})
         return EXIT_OK
-    from rich.table import Table
-
     from mavsitl.cli import screen
 
-    table = Table("scenario", "title", "airframe", "wind", "reference", "level")
+    console = screen.console()
+    columns = ["scenario", "title", "airframe", "wind", "reference", "level"]
+    if console.width < WIDE:
+        columns.pop()
+    table = screen.table(*columns, whole=set(columns) - {"title"})
     for flight in flights:
         s = flight.scenario
         wind = " + ".join(str(model.__struct_config__.tag) for model in s.wind) or "calm"
-        table.add_row(
-            flight.name, s.title, s.airframe, wind, str(s.reference.__struct_config__.tag), s.controller.level
-        )
-    screen.console().print(table)
+        cells = (flight.name, s.title, s.airframe, wind, str(s.reference.__struct_config__.tag), s.controller.level)
+        table.add_row(*cells[: len(columns)])
+    console.print(table)
     return EXIT_OK
 
 
@@ -65,14 +69,11 @@ def _chaos(options: argparse.Namespace) -> int:
         ]  # fmt: skip
         print_json(rows)
         return EXIT_OK
-    from rich.table import Table
-
     from mavsitl.cli import screen
 
     console = screen.console()
     for group in dict.fromkeys(row.group for row in TABLE.values()):
-        table = Table("mode", "what goes wrong", title=group, title_justify="left", title_style="bold", expand=True)
-        table.columns[0].no_wrap = True
+        table = screen.table("mode", "what goes wrong", title=group, whole=("mode",))
         for name, row in TABLE.items():
             if row.group == group:
                 defaults = ", ".join(f"{each.name} {each.default}" for each in row.arguments if each.default)

@@ -168,9 +168,7 @@ def _print_sweep_json(results: Path, rows: Sequence[Row], summary: Summary) -> N
 
 
 def _show_sweep(console: Console, summary: Summary) -> None:
-    from rich import box
-    from rich.table import Table
-
+    from mavsitl.cli import screen
     from mavsitl.report import sweep_tables
 
     shown = [("medians, 95 % intervals", sweep_tables.cell_header(summary), sweep_tables.cell_rows(summary))]
@@ -178,9 +176,7 @@ def _show_sweep(console: Console, summary: Summary) -> None:
         header, rows = list(sweep_tables.COMPARISON_HEADER), sweep_tables.comparison_rows(summary)
         shown.append(("seed by seed: median difference and ratio, Wilcoxon's p", header, rows))
     for title, header, rows in shown:
-        table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
-        for column in header:
-            table.add_column(column, justify="left" if column in ("", "measure") else "right")
+        table = screen.table(*header, title=title, right=set(header) - {"", "measure"})
         for cells in rows:
             table.add_row(*cells)
         console.print(table)

@@ -158,7 +158,6 @@ def _write(tuning: Tuning, folder: Path) -> list[Path]:
 
 def _show(tuning: Tuning, paths: Sequence[Path]) -> None:
     from rich.markup import escape
-    from rich.table import Table
 
     from mavsitl.cli import screen
     from mavsitl.report.sweep_tables import bounds, probability
@@ -166,18 +165,15 @@ def _show(tuning: Tuning, paths: Sequence[Path]) -> None:
     from mavsitl.tune import result
 
     console = screen.console()
-    table = Table("measure", "seeds", title="before and after", title_justify="left", title_style="bold")
-    for column in ("before", "after", "ratio, seed by seed", "p"):
-        table.add_column(column, justify="right")
+    numbers = ("before", "after", "ratio, seed by seed", "p")
+    table = screen.table("measure", "seeds", *numbers, title="before and after", right=numbers)
     for row in result.measures(tuning):
         cells = [row.name, row.seeds, number(row.before), number(row.after)]
         if row.paired is not None:
             cells += [bounds(row.paired.ratio), probability(row.paired.p_value)]
         table.add_row(*(escape(cell) for cell in cells))
     console.print(table)
-    table = Table("key", title="gains", title_justify="left", title_style="bold")
-    for column in ("before", "after", "range", ""):
-        table.add_column(column, justify="right")
+    table = screen.table("key", "before", "after", "range", "", title="gains", right=("before", "after", "range"))
     for gain in result.gains(tuning):
         bound = "at its bound" if gain.at_bound else ""
         key = gain.key.replace("[", r"\[")
