@@ -58,7 +58,7 @@ def test_logs_are_kept_from_where_they_are_written() -> None:
 
 @pytest.mark.sockets
 def test_the_step_that_flies_beside_a_vehicle_does(tmp_path: Path) -> None:
-    """In a network namespace, where PX4's ports are free, and with a program that waits for the vehicle's first word."""
+    """In a network namespace, where PX4's ports are free; the program waits for the vehicle's first word."""
     if shutil.which("unshare") is None or os.geteuid() != 0:
         pytest.skip("needs root to make a network namespace")
     (tmp_path / "examples").mkdir()
