@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mavsitl import __version__, drivers, fleet, process, realtime, wings
 from mavsitl.clock import monotonic_us, unix_us
 from mavsitl.drivers import Progress, RealTime, Tap
+from mavsitl.errors import UsageError
 from mavsitl.fleet import FleetOutcome, Flown
 from mavsitl.herald import Herald
 from mavsitl.link.address import Address
@@ -284,7 +285,7 @@ class VehicleLinks:
         return ", ".join(bound)
 
 
-class ExposedError(Exception):
+class ExposedError(UsageError):
     """A vehicle would be open to a network without a key, and nobody said that it may. The text names the ways out."""
 
 

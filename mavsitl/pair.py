@@ -15,18 +15,16 @@ from typing import IO, Any
 
 import msgspec
 
+from mavsitl.errors import EXIT_USAGE, MavsitlError
 from mavsitl.link.udp import LOOPBACK
 from mavsitl.scenario import ScenarioError
-
-EXIT_USAGE = 2
-"""What an end exits with when its arguments or its scenario are wrong."""
 
 Event = dict[str, Any]
 OnEvent = Callable[[str, Event], None]
 """(end, event): end is "vehicle" or "ground"; events are what ``--status json`` prints, a JSON object a line."""
 
 
-class PairError(RuntimeError):
+class PairError(MavsitlError, RuntimeError):
     """One of the two processes failed; the message is its own."""
 
 

@@ -15,6 +15,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from mavsitl.errors import MavsitlError
+
 __all__ = ["PRIORITY", "RealTimeError", "Wish", "check", "claim", "fine_timers"]
 
 PRIORITY = 20
@@ -45,7 +47,7 @@ class Wish(Enum):
     BEST_EFFORT = "best effort"
 
 
-class RealTimeError(Exception):
+class RealTimeError(MavsitlError):
     """`--realtime` was asked for and is not allowed; the text says how to allow it."""
 
 

@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import msgspec
 
 from mavsitl.airframes import Airframe, NonNegative, Positive
+from mavsitl.errors import UsageError, did_you_mean
 
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Level: TypeAlias = Literal["attitude", "body_rate", "torque"]
@@ -27,7 +28,7 @@ Vector3: TypeAlias = tuple[float, float, float]
 MICROSECONDS_PER_SECOND = 1_000_000
 
 
-class ScenarioError(ValueError):
+class ScenarioError(UsageError):
     """The user's scenario or airframe file is wrong; the message names the file, the key and what is allowed."""
 
 
@@ -541,14 +542,15 @@ def text_of(name_or_path: str) -> str:
     return _read("scenarios", name_or_path, names())[0]
 
 
+def airframe_names() -> list[str]:
+    """The shipped airframes."""
+    folder = resources.files("mavsitl") / "airframes"
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
 def load_airframe(name_or_path: str, folder: Path | None = None) -> Airframe:
     """Read a shipped airframe by name, or a file by path (relative to `folder`). Raises `ScenarioError`."""
-    shipped = sorted(
-        entry.name.removesuffix(".toml")
-        for entry in (resources.files("mavsitl") / "airframes").iterdir()
-        if entry.name.endswith(".toml")
-    )
-    text, where, _ = _read("airframes", name_or_path, shipped, folder)
+    text, where, _ = _read("airframes", name_or_path, airframe_names(), folder)
     airframe: Airframe = _convert(_parse(text, where), Airframe, where)
     return airframe
 
@@ -560,7 +562,8 @@ def _read(kind: str, name_or_path: str, shipped: list[str], folder: Path | None 
     path = (folder or Path()) / name_or_path
     if path.suffix != ".toml":
         raise ScenarioError(
-            f"{name_or_path}: no such shipped file and not a .toml path; shipped {kind}: {', '.join(shipped)}"
+            f"{name_or_path}: no such shipped file and not a .toml path; "
+            f"{did_you_mean(name_or_path, shipped)}shipped {kind}: {', '.join(shipped)}"
         )
     try:
         return path.read_text("utf-8"), str(path), path.parent

@@ -6,10 +6,15 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, Literal
 
+from mavsitl.errors import UsageError
+
 Group = Literal["mavsitl.vehicle", "mavsitl.ground"]
 
 BOOT_GROUP = "mavsitl.boot"
 """``heartbeat(sequence, system_id) -> frame`` of a vehicle, under its own name: what is sent while it is loaded."""
+
+PARAMETERS_GROUP = "mavsitl.parameters"
+"""An iterable of the names of a vehicle's parameters."""
 
 VEHICLE_GROUP: Group = "mavsitl.vehicle"
 GROUND_GROUP: Group = "mavsitl.ground"
@@ -17,7 +22,7 @@ GROUND_GROUP: Group = "mavsitl.ground"
 _SHIPPED = {VEHICLE_GROUP: "quadrotor", GROUND_GROUP: "paper"}
 
 
-class WingError(LookupError):
+class WingError(UsageError, LookupError):
     """No such wing is installed; the message lists those that are."""
 
 
@@ -34,6 +39,11 @@ def find_boot(name: str | None = None) -> Any | None:
     """The HEARTBEAT of a vehicle wing that is still to be loaded; None where it has none."""
     wanted = name or _SHIPPED[VEHICLE_GROUP]
     return next((point.load() for point in _installed().select(group=BOOT_GROUP) if point.name == wanted), None)
+
+
+def parameter_names() -> list[str]:
+    """Of the vehicles that are installed and tell them, without a vehicle that runs."""
+    return sorted({name for point in _installed().select(group=PARAMETERS_GROUP) for name in point.load()})
 
 
 @cache

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from mavsitl.errors import MavsitlError, UsageError
 
-class GridError(ValueError):
+
+class GridError(UsageError):
     """What is to be swept is not understood; the message names it and what is allowed."""
 
 
-class CampaignError(RuntimeError):
+class CampaignError(MavsitlError, RuntimeError):
     """A campaign cannot go on; the message says why and what to do."""
 
 

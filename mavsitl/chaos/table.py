@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from mavsitl.chaos import commands, files, missions, parameters, telemetry
 from mavsitl.chaos.base import Double, Ignore, Lose, Mode
 from mavsitl.dialect import mavlink
+from mavsitl.errors import UsageError, did_you_mean
 
 __all__ = ["ALL_PORTS", "PORTS", "TABLE", "Argument", "ChaosError", "Row", "Spec", "parse"]
 
@@ -18,7 +19,7 @@ ALL_PORTS = "all"
 PORTS = (ALL_PORTS, "offboard", "gcs")
 
 
-class ChaosError(ValueError):
+class ChaosError(UsageError):
     """A mode, an argument or a port that does not exist; the message names what does."""
 
 
@@ -523,9 +524,7 @@ def parse(text: str) -> Spec:
     name, *given = mode.split(":")
     row = TABLE.get(name)
     if row is None:
-        near = get_close_matches(name, TABLE, 4, 0.5)
-        meant = f"did you mean {', '.join(near)}? " if near else ""
-        raise ChaosError(f"no chaos mode '{name}'; {meant}'mavsitl chaos' lists all")
+        raise ChaosError(f"no chaos mode '{name}'; {did_you_mean(name, TABLE)}'mavsitl chaos' lists all")
     if len(given) > len(row.arguments):
         raise ChaosError(f"chaos mode '{text}': too many arguments; allowed: {row.usage(name)}")
     values = []

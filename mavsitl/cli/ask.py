@@ -13,11 +13,13 @@ from mavsitl.cli.common import (
     SYSTEM,
     UsageError,
     above_zero,
+    add_json,
     command,
     not_negative,
     print_json,
     whole,
 )
+from mavsitl.errors import did_you_mean
 
 if TYPE_CHECKING:
     from mavsitl.ask import Reply, Task
@@ -148,10 +150,12 @@ def _add_ask_options(parser: argparse.ArgumentParser, default: str) -> None:
         "--timeout", type=above_zero, default=ANSWER_S, metavar="S",
         help=f"seconds to wait for the vehicle, and for each answer (default: {ANSWER_S:g})",
     )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print the reply as JSON and nothing else")
+    add_json(parser, "the reply")
 
 
 def _link(options: argparse.Namespace) -> int:
+    from msgspec.structs import replace
+
     from mavsitl import ends
     from mavsitl.ask import ParameterTask
     from mavsitl.link.settings import PREFIXES, initial
@@ -172,7 +176,7 @@ def _link(options: argparse.Namespace) -> int:
     if not reply.ok and reply.vehicle is not None and wanted.get("DOWN"):
         other = options.instance + (ends.OFFBOARD_PORT if options.gcs else ends.GCS_PORT)
         hint = f"an outage of the link that is spoken on has no answer; over --endpoint udpout:127.0.0.1:{other} it has"
-        reply = _replace(reply, problem=f"{reply.problem} ({hint})")
+        reply = replace(reply, problem=f"{reply.problem} ({hint})")
 
     def show() -> None:
         for option, name in LINK_OPTIONS.items():
@@ -201,7 +205,8 @@ def _inject(options: argparse.Namespace) -> int:
         if name is None:
             raise UsageError(f"{what}: missing; allowed: {', '.join(known)}")
         if name not in known:
-            raise UsageError(f"{what}: {name!r} is not allowed; allowed: {', '.join(known)}")
+            meant = did_you_mean(name, known)
+            raise UsageError(f"{what}: {name!r} is not allowed; {meant}allowed: {', '.join(known)}")
     params = (float(units[options.unit]), float(kinds[options.type]), float(options.instance))
     reply = _ask(options, ask.CommandTask(mavlink.MAV_CMD_INJECT_FAILURE, *params))
     which = f" {options.instance}" if options.instance else ""
@@ -210,6 +215,8 @@ def _inject(options: argparse.Namespace) -> int:
 
 def _param(options: argparse.Namespace) -> int:
     from fnmatch import fnmatchcase
+
+    from msgspec.structs import replace
 
     from mavsitl.ask import ListTask, ParameterTask
 
@@ -229,7 +236,7 @@ def _param(options: argparse.Namespace) -> int:
         pattern = options.names[0]
         found = {name: value for name, value in reply.parameters.items() if fnmatchcase(name, pattern)}
         problem = reply.problem or ("" if found else f"vehicle {reply.vehicle} has no parameter like {pattern!r}")
-        reply = _replace(reply, ok=not problem, parameters=found, problem=problem)
+        reply = replace(reply, ok=not problem, parameters=found, problem=problem)
 
     def show() -> None:
         for name, value in reply.parameters.items():
@@ -259,6 +266,8 @@ def _wish(text: str, to_set: bool) -> tuple[str, float | None]:
 
 def _ask(options: argparse.Namespace, task: Task, port: int | None = None) -> Reply:
     """The vehicle's answer; `port`: of loopback, plus the instance, where no endpoint is named."""
+    from msgspec.structs import replace
+
     from mavsitl import ends
     from mavsitl.link.address import parse_address
 
@@ -267,7 +276,7 @@ def _ask(options: argparse.Namespace, task: Task, port: int | None = None) -> Re
     port = ends.GCS_PORT if port is None else port
     address = parse_address(options.endpoint or f"udpout:127.0.0.1:{port + options.instance}")
     reply = ends.ask(task, address, system_id=options.system, patience_s=options.timeout)
-    return reply if reply.ok else _replace(reply, problem=f"{address}: {reply.problem}")
+    return reply if reply.ok else replace(reply, problem=f"{address}: {reply.problem}")
 
 
 def _tell(options: argparse.Namespace, reply: Reply, done: Callable[[], None]) -> int:
@@ -282,9 +291,3 @@ def _tell(options: argparse.Namespace, reply: Reply, done: Callable[[], None]) -
     if not reply.ok:
         print(f"mavsitl {options.command}: {reply.problem}", file=sys.stderr)
     return EXIT_OK if reply.ok else EXIT_FAILED
-
-
-def _replace(reply: Reply, **changes: Any) -> Reply:
-    import msgspec
-
-    return msgspec.structs.replace(reply, **changes)

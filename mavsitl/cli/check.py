@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from mavsitl.cli.common import EXIT_FAILED, EXIT_OK, above_zero, command, print_json
+from mavsitl.cli.common import EXIT_FAILED, EXIT_OK, above_zero, add_json, command, print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -60,18 +60,17 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="listen only: send no HEARTBEAT and ask nothing")
     parser.add_argument("--all", action="store_true", help="list every kind of message of every source")
-    parser.add_argument("--json", action="store_true", help="print the report as JSON and nothing else")
+    add_json(parser, "the report")
     parser.set_defaults(run=_check)
 
 
 def _check(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from mavsitl import ends
+    from mavsitl.cli import screen
     from mavsitl.link.address import parse_address
 
     endpoints = None if options.listen is None else [parse_address(text) for text in options.listen]
-    console = Console(highlight=False)
+    console = screen.console()
     if options.json or not console.is_terminal:
         report = ends.check(endpoints, duration_s=options.duration_s, ask=not options.quiet)
     else:
@@ -111,15 +110,13 @@ def _show_check(console: Console, report: Report, *, everything: bool) -> None:
 
 
 def _show_port(console: Console, port: PortReport, *, everything: bool) -> None:
-    from rich import box
-    from rich.table import Table
+    from mavsitl.cli import screen
 
     seen = f"{port.datagrams} datagrams, {port.frames} good frames" if port.datagrams else "nothing came"
     console.print(f"[bold]{port.ear.endpoint}[/]  {seen}")
     if port.heard:
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-        for name in ("from", "id", "what", "MAVLink", "rate", "lost", "answer"):
-            table.add_column(name, justify="right" if name in ("rate", "lost") else "left", no_wrap=name == "from")
+        columns = ("from", "id", "what", "MAVLink", "rate", "lost", "answer")
+        table = screen.table(*columns, right=("rate", "lost"), whole=("from",))
         for heard in port.heard:
             table.add_row(*_heard_cells(heard))
         console.print(table)
@@ -153,13 +150,12 @@ def _spoken(name: str) -> str:
 
 
 def _show_kinds(console: Console, heard: Heard, *, everything: bool) -> None:
-    from rich.table import Table
+    from mavsitl.cli import screen
 
     name = f"{heard.system_id}/{heard.component_id} at {heard.address}"
     if everything:
-        table = Table(f"messages of {name}", "id", "number", "1/s", "B/s")
-        for column in table.columns[1:]:
-            column.justify = "right"
+        numbers = ("id", "number", "1/s", "B/s")
+        table = screen.table(f"messages of {name}", *numbers, right=numbers)
         for kind in heard.kinds:
             table.add_row(kind.name, f"{kind.id}", f"{kind.messages}", f"{kind.per_s:.1f}", f"{kind.bytes_per_s:.0f}")
         console.print(table)

@@ -1,13 +1,23 @@
-"""What the commands share: exit codes, types of arguments, the scenario's options, signals."""
+"""What the commands share: exit codes, signals, types of arguments, the scenario's options, where a run's files are."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import shlex
 import signal
+import sys
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+# Of these each command takes what it raises and returns from here.
+from mavsitl.errors import EXIT_FAILED as EXIT_FAILED
+from mavsitl.errors import EXIT_OK as EXIT_OK
+from mavsitl.errors import EXIT_USAGE as EXIT_USAGE
+from mavsitl.errors import UsageError as UsageError
 
 if TYPE_CHECKING:
     from mavsitl.scenario import Flight
@@ -18,14 +28,8 @@ PAPER_SCENARIOS = ("hover-calm", "hover-wind", "spiral-calm", "spiral-wind")
 SLOWEST_SPEED = 0.5
 """Clients miss a HEARTBEAT after 3 s of wall clock."""
 
-EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
-
 EXIT_SIGNAL = 128
 """And the signal's number, as shells say it: 130 is Ctrl-C."""
-
-
-class UsageError(ValueError):
-    """Arguments that do not go together."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -48,16 +52,49 @@ def on_signals(handler: Callable[[int, Any], None]) -> None:
             signal.signal(number, handler)
 
 
-class Formatter(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=32, width=110)
+@contextmanager
+def leaving(note: Callable[[], str]) -> Iterator[None]:
+    """Where this ends early, by an error or a signal, `note` is asked for a line to be told with it; empty: none."""
+    try:
+        yield
+    except BaseException as ended:
+        if text := note():
+            ended.add_note(text)
+        raise
+
+
+@contextmanager
+def logs_in(folder: Path | None) -> Iterator[None]:
+    """Where this ends early, the user is told of the folder if anything was written there; None: there is no folder."""
+
+    def written() -> dict[Path, int]:
+        files = () if folder is None else folder.rglob("*")
+        return {file: file.stat().st_mtime_ns for file in files}
+
+    before = written()
+    with leaving(lambda: "" if written() == before else f"logs so far: {folder}"):
+        yield
+
+
+def run_folder(named: Path | None, stamp: str) -> Path:
+    """Of a run that began at `stamp` (`clock.utc_stamp`)."""
+    return named or Path("runs") / stamp.replace(":", "").replace("-", "")
+
+
+def command_line() -> str:
+    """How this program was called, to be kept with what it writes."""
+    return "mavsitl " + shlex.join(sys.argv[1:])
 
 
 def command(commands: Any, name: str, summary: str, description: str, epilog: str = "") -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=summary, description=description, epilog=epilog, formatter_class=Formatter
-    )
+    """A command of its own below `commands`: `summary` is its line in the list, the others are its help."""
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=summary, description=description, epilog=epilog)
     return parser
+
+
+def add_json(group: Any, what: str) -> None:
+    """The option of a command that prints one value for a program; `what` it is."""
+    group.add_argument("--json", action="store_true", help=f"print {what} as JSON and nothing else")
 
 
 def whole(least: int, most: int) -> Callable[[str], int]:

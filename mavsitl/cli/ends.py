@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavsitl.cli.common import Interrupted, UsageError, above_zero, on_signals, whole
+from mavsitl.cli.common import Interrupted, UsageError, above_zero, logs_in, on_signals, whole
 
 if TYPE_CHECKING:
     from mavsitl.ends import Outcome
@@ -52,15 +53,18 @@ def add_end_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--run-dir", type=Path, metavar="DIR", help="write logs there (default: none)")
     group.add_argument("--wing", metavar="NAME", help="another installed vehicle or controller, by its entry point")
     group.add_argument(
-        "--status", choices=("text", "json"), default="text", help="json: one object a line on stdout, for programs"
+        "--json", action="store_const", dest="status", const="json", help="print one JSON object a line, for programs"
     )
+    group.add_argument("--status", choices=("text", "json"), default="text", help="json: as --json")
 
 
 class Status:
     """What an end tells while it runs: lines for a person, or JSON objects for a program. Also its stop flag."""
 
-    def __init__(self, as_json: bool) -> None:
+    def __init__(self, as_json: bool, logs: Path | None = None) -> None:
+        """`logs`: the folder that they go to; None: none are written."""
         self._as_json = as_json
+        self._logs = logs
         self._signal = 0
         on_signals(self._stop)
 
@@ -88,6 +92,12 @@ class Status:
         else:
             print(text, flush=True)
 
+    def start(self, text: str) -> None:
+        """`text` is who and where; told with it is where the logs go."""
+        self.say(text)
+        if self._logs is not None:
+            self.say(f"logs: {self._logs}")
+
     def end(self, outcome: Outcome) -> None:
         if self._as_json:
             self._print({
@@ -98,34 +108,27 @@ class Status:
                     "lateness_us": outcome.lateness_us, "rebased": outcome.rebased, "lost_s": outcome.lost_s,
                 }),
                 **({"lost": outcome.lost} if outcome.lost else {}),
-                "dropped": outcome.dropped, **outcome.links,
+                "dropped": outcome.dropped, **outcome.links, **self._where(),
             })  # fmt: skip
             return
-        print(
-            f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time; "
-            f"{outcome.frames} frames in"
-        )
-        if outcome.lost:
-            print(f"lost: {outcome.lost}")
-        if outcome.dropped:
-            print("dropped: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
-        for place, directions in outcome.links.items():
-            for direction, counts in directions.items():
-                shown = ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
-                print(f"{place} {direction}: {shown}")
-        if outcome.lateness_us is not None:
-            p50, p99 = outcome.lateness_us
-            print(
-                f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; "
-                f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
-            )
+        self._tell_end(_end_lines(outcome), lost=bool(outcome.lost))
 
     def end_fleet(self, outcome: FleetOutcome) -> None:
         if self._as_json:
-            self._print(outcome.as_event())
+            self._print(outcome.as_event() | self._where())
             return
-        for line in fleet_table(outcome):
-            print(line)
+        self._tell_end(fleet_table(outcome), lost=bool(outcome.lost))
+
+    def _where(self) -> dict[str, str]:
+        return {} if self._logs is None else {"logs": f"{self._logs}"}
+
+    def _tell_end(self, lines: Sequence[str], *, lost: bool) -> None:
+        where = "" if self._logs is None else f"logs: {self._logs}"
+        if lost and not where:
+            where = "logs: none; --run-dir DIR keeps them"
+        for line in (*lines, where):
+            if line:
+                print(line)
 
     def _print(self, event: dict[str, Any]) -> None:
         import msgspec
@@ -134,10 +137,27 @@ class Status:
         sys.stdout.flush()
 
 
+def _end_lines(outcome: Outcome) -> list[str]:
+    lines = [_pace(outcome)]
+    if outcome.lost:
+        lines.append(f"lost: {outcome.lost}")
+    return [*lines, *_dropped(outcome), *_links("", outcome.links), *_lateness(outcome)]
+
+
+def tells_logs(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    """Of a command with --run-dir: however it ends, the user is told what was written there."""
+
+    @wraps(run)
+    def command(options: argparse.Namespace) -> int:
+        with logs_in(options.run_dir):
+            return run(options)
+
+    return command
+
+
 def fleet_table(outcome: FleetOutcome) -> list[str]:
     """For a person: each vehicle in a line, and what is of all."""
-    total = f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time"
-    lines = [f"{total}; {outcome.frames} frames in, {len(outcome.vehicles)} vehicles"]
+    lines = [f"{_pace(outcome)}, {len(outcome.vehicles)} vehicles"]
     if any(each.rms_m is not None for each in outcome.vehicles):
         lines.append(f"{'vehicle':>7} {'flown s':>8} {'rms m':>7} {'worst m':>8}  end")
         for each in outcome.vehicles:
@@ -149,20 +169,37 @@ def fleet_table(outcome: FleetOutcome) -> list[str]:
             f"collision of vehicles {collision.vehicle} and {collision.other} at t = {collision.time_s:.2f} s: "
             f"{collision.distance_m:.2f} m"
         )
-    if outcome.dropped:
-        lines.append("dropped: " + ", ".join(f"{name} {count}" for name, count in outcome.dropped.items()))
+    lines += _dropped(outcome)
     for each in outcome.vehicles:
-        for place, directions in each.link.items():
-            for direction, counts in directions.items():
-                shown = ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
-                lines.append(f"vehicle {each.system_id}, {place} {direction}: {shown}")
-    if outcome.lateness_us is not None:
-        p50, p99 = outcome.lateness_us
-        lines.append(
-            f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; "
-            f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
-        )
-    return lines
+        lines += _links(f"vehicle {each.system_id}, ", each.link)
+    return lines + _lateness(outcome)
+
+
+def _pace(outcome: Outcome | FleetOutcome) -> str:
+    flown = f"{outcome.simulated_s:.1f} s in {outcome.wall_s:.1f} s, {outcome.speed:.2f} x real time"
+    return f"{flown}; {outcome.frames} frames in"
+
+
+def _dropped(outcome: Outcome | FleetOutcome) -> list[str]:
+    counts = ", ".join(f"{name} {count}" for name, count in outcome.dropped.items())
+    return [f"dropped: {counts}"] if counts else []
+
+
+def _links(whose: str, links: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
+    """A line for each direction of each bad link: its counts that are not 0."""
+    return [
+        f"{whose}{place} {direction}: " + ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
+        for place, directions in links.items()
+        for direction, counts in directions.items()
+    ]
+
+
+def _lateness(outcome: Outcome | FleetOutcome) -> list[str]:
+    if outcome.lateness_us is None:  # nobody is late in lock-step
+        return []
+    p50, p99 = outcome.lateness_us
+    given_up = f"schedule moved {outcome.rebased} times, {outcome.lost_s:.1f} s given up"
+    return [f"tick lateness p50 {p50:.0f} us, p99 {p99:.0f} us; {given_up}"]
 
 
 def check_effect(options: argparse.Namespace, end: str, names: Sequence[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,20 +11,26 @@ from mavsitl.cli.common import (
     EXIT_OK,
     PAPER_SCENARIOS,
     UsageError,
+    add_json,
     add_scenario_options,
     command,
+    command_line,
     interrupt,
     load,
+    logs_in,
     on_signals,
     print_json,
+    run_folder,
     settings_of,
 )
 from mavsitl.cli.ends import COUNT, fleet_table
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as RichProgress
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
 
     from mavsitl.report.run import FlightRecord
+    from mavsitl.report.tables import Row
     from mavsitl.scenario import Flight
 
 
@@ -63,15 +68,12 @@ def add(commands: Any) -> None:
         help="a formation of N vehicles, each with its controller, in one process; logs and a table, no report",
     )  # fmt: skip
     group.add_argument("--no-report", action="store_true", help="logs and tables only")
-    group.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
+    add_json(group, "the result")
     parser.set_defaults(run=_fly)
 
 
 def _fly(options: argparse.Namespace) -> int:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    from mavsitl import pair
+    from mavsitl.cli import screen
     from mavsitl.clock import utc_stamp
     from mavsitl.report import run as runs
 
@@ -82,51 +84,42 @@ def _fly(options: argparse.Namespace) -> int:
     if options.count is not None:
         return _fly_fleet(options, flights)
     created = utc_stamp()
-    folder: Path = options.run_dir or Path("runs") / created.replace(":", "").replace("-", "")
-    console = Console(stderr=options.json)
+    folder = run_folder(options.run_dir, created)
+    console = screen.console(stderr=options.json)
     records: list[FlightRecord] = []
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[said]}"), TimeElapsedColumn(),
-        console=console, disable=not console.is_terminal,
-    )  # fmt: skip
-    try:
-        with bar:
+    with logs_in(folder):
+        with screen.flight_progress(console) as bar:
             for index, (name, flight) in enumerate(zip(names, flights, strict=True)):
                 alone = [other.name for other in flights].count(flight.name) == 1
                 title = flight.name if alone else f"{flight.name}-{index + 1}"
                 task = bar.add_task(f"{title:20s}", total=flight.scenario.duration_s, said="starting")
-                flown = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task, pair)
+                flown = _fly_one(name, flight, settings, folder / title, options.in_memory, bar, task)
                 records.append(runs.record(flight, folder=title, **flown))
-                runs.write_run(folder, runs.new_run("mavsitl " + " ".join(sys.argv[1:]), created, tuple(records)))
-    except KeyboardInterrupt:
-        console.print(f"interrupted; the logs so far are in {folder}")
-        raise
-    return _show(console, options, folder, records)
+                runs.write_run(folder, runs.new_run(command_line(), created, tuple(records)))
+        return _show(console, options, folder, records)
 
 
 def _fly_fleet(options: argparse.Namespace, flights: list[Flight]) -> int:
     """A formation in memory; there is no page for one, each vehicle's logs have a folder."""
-    from rich.console import Console
-
     from mavsitl import ends
+    from mavsitl.cli import screen
     from mavsitl.clock import utc_stamp
 
     if len(flights) != 1:
         raise UsageError(f"--count: one scenario, not {len(flights)}")
     (flight,) = flights
-    folder: Path = options.run_dir or Path("runs") / utc_stamp().replace(":", "").replace("-", "")
-    console = Console(stderr=True)
-    with console.status(f"{flight.name}, {options.count} vehicles") as shown:
+    folder = run_folder(options.run_dir, utc_stamp())
+    title = f"{flight.name}, {options.count} vehicles"
+    with logs_in(folder), screen.console(stderr=True).status(title) as shown:
 
         def move(time_s: float) -> None:
-            shown.update(f"{flight.name}, {options.count} vehicles: {max(time_s, 0.0):.1f} s")
+            shown.update(f"{title}: {max(time_s, 0.0):.1f} s")
 
         outcome = ends.fleet_in_memory(
             flight, folder / flight.name, count=options.count, report=lambda text: None, progress=move
         )
     if options.json:
-        event = outcome.as_event() | {"folder": str(folder)}
-        print_json(event)
+        print_json(outcome.as_event() | {"folder": str(folder)})
     else:
         for line in fleet_table(outcome):
             print(line)
@@ -135,9 +128,10 @@ def _fly_fleet(options: argparse.Namespace, flights: list[Flight]) -> int:
 
 
 def _fly_one(
-    name: str, flight: Flight, settings: list[str], folder: Path, memory: bool, bar: RichProgress, task: Any, pair: Any
+    name: str, flight: Flight, settings: list[str], folder: Path, in_memory: bool, bar: Progress, task: TaskID
 ) -> dict[str, Any]:
     """One flight; what `run.record` wants to know of it."""
+    from mavsitl import pair
 
     def move(time_s: float) -> None:
         bar.update(task, completed=max(time_s, 0.0), said=f"{max(time_s, 0.0):5.1f} s")
@@ -148,7 +142,7 @@ def _fly_one(
         elif event["event"] == "report":
             bar.update(task, said=event["text"])
 
-    if memory:
+    if in_memory:
         from mavsitl import ends
 
         outcome = ends.in_memory(flight, folder, report=lambda text: bar.update(task, said=text), progress=move)
@@ -170,9 +164,9 @@ def _fly_one(
     }  # fmt: skip
 
 
-def _show(console: Any, options: argparse.Namespace, folder: Path, records: list[FlightRecord]) -> int:
-    from rich.table import Table
-
+def _show(console: Console, options: argparse.Namespace, folder: Path, records: list[FlightRecord]) -> int:
+    """What came of the flights, from their logs: tables or JSON, the page, and where all of it is."""
+    from mavsitl.cli import screen
     from mavsitl.log.flight import FlightData
     from mavsitl.report import tables
     from mavsitl.report.metrics import rmse
@@ -181,50 +175,49 @@ def _show(console: Any, options: argparse.Namespace, folder: Path, records: list
     lost = []
     for record in records:
         data = FlightData.from_folder(folder / record.folder, duration_s=record.duration_s)
-        rows = tables.rows(rmse(data), record.paper_case)
-        results.append((record, rows))
+        results.append((record, tables.rows(rmse(data), record.paper_case)))
         if record.lost:
-            lost.append((record, float(data.time_s[-1])))
+            said = f"{record.name} was lost after {data.time_s[-1]:.1f} s: {record.lost}"
+            lost.append(f"{said}\nlook at: mavsitl log info {folder / record.folder}")
     if options.json:
         _print_json(folder, results)
     else:
         for record, rows in results:
-            facts = (
-                f"{record.law}, {record.level}, wind information: {_loud(record.wind_information)}, seed {record.seed}"
-            )
-            console.print(f"\n[bold]{record.title}[/]  {facts}", soft_wrap=True, highlight=False)
-            table = Table()
-            for column in ("RMSE", "ours", "paper", "ours / paper"):
-                table.add_column(column, justify="left" if column == "RMSE" else "right")
-            for row in rows:
-                paper = "" if row.paper is None else tables.number(row.paper)
-                ratio = (
-                    "" if row.ratio is None or row.verdict is None else f"{row.ratio:.2f} {tables.SYMBOLS[row.verdict]}"
-                )
-                style = {"beaten": "green", "met": "green", "missed": "yellow"}.get(row.verdict or "", "")
-                table.add_row(row.state, tables.number(row.ours), paper, f"[{style}]{ratio}[/]" if style else ratio)
-            console.print(table)
-            for link in tables.link_rows(record.links):
-                console.print(f"link {link}", soft_wrap=True, highlight=False)
+            _show_flight(console, record, rows)
     if not options.no_report:
         from mavsitl.report.html import write_report
 
-        page = write_report(folder)
-        console.print(f"report: {page}", soft_wrap=True, highlight=False)
-    console.print(f"logs:   {folder}", soft_wrap=True, highlight=False)
-    for record, end_s in lost:
-        console.print(
-            f"[bold red]{record.name} was lost after {end_s:.1f} s:[/] {record.lost}", soft_wrap=True, highlight=False
-        )
+        screen.line(console, f"report: {write_report(folder)}")
+    screen.line(console, f"logs:   {folder}")
+    for text in lost:
+        screen.line(console, text, "bold red")
     return EXIT_FAILED if lost else EXIT_OK
 
 
-def _loud(source: str) -> str:
-    return "ORACLE (true wind)" if source == "oracle" else source
+def _show_flight(console: Console, record: FlightRecord, rows: list[Row]) -> None:
+    """Its root mean square errors beside the paper's, and what its links did."""
+    from rich.markup import escape
+
+    from mavsitl.cli import screen
+    from mavsitl.report import tables
+
+    wind = "ORACLE (true wind)" if record.wind_information == "oracle" else record.wind_information
+    facts = f"{record.law}, {record.level}, wind information: {wind}, seed {record.seed}"
+    console.print(f"\n[bold]{escape(record.title)}[/]  {facts}", soft_wrap=True)
+    columns = ("RMSE", "ours") if record.paper_case is None else ("RMSE", "ours", "paper", "ours / paper")
+    table = screen.table(*columns, right=columns[1:])
+    for row in rows:
+        cells = [row.state, tables.number(row.ours)]
+        if row.paper is not None and row.ratio is not None and row.verdict is not None:
+            style = {"beaten": "green", "met": "green", "missed": "yellow"}[row.verdict]
+            cells += [tables.number(row.paper), f"[{style}]{row.ratio:.2f} {tables.SYMBOLS[row.verdict]}[/]"]
+        table.add_row(*cells)
+    console.print(table)
+    for link in tables.link_rows(record.links):
+        screen.line(console, f"link {link}")
 
 
-def _print_json(folder: Path, results: list[Any]) -> None:
-
+def _print_json(folder: Path, results: list[tuple[FlightRecord, list[Row]]]) -> None:
     flights = [
         {
             "flight": record,

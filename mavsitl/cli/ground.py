@@ -26,6 +26,7 @@ from mavsitl.cli.ends import (
     check_effect,
     check_fleet,
     check_lockstep,
+    tells_logs,
     wish_for_real_time,
 )
 
@@ -85,6 +86,7 @@ def add(commands: Any) -> None:
 
 
 @process.starting()
+@tells_logs
 def _ground(options: argparse.Namespace) -> int:
     from mavsitl import ends
     from mavsitl.link.address import parse_address
@@ -99,7 +101,7 @@ def _ground(options: argparse.Namespace) -> int:
     first_id = options.system if options.system is not None else options.instance + 1
     if count := check_fleet(options, first_id):
         return _ground_fleet(options, flight, address, first_id, count, wish)
-    status = Status(options.status == "json")
+    status = Status(options.status == "json", options.run_dir)
     if options.lockstep:
         if not address.kind.startswith("udp"):
             raise UsageError(f"--link {options.link}: with --lockstep it is udpin:HOST:PORT")
@@ -111,7 +113,7 @@ def _ground(options: argparse.Namespace) -> int:
             report=status.say, progress=status.progress,
         )  # fmt: skip
     else:
-        status.say(f"ground ({flight.name}): waiting for a vehicle on {address}; Ctrl-C ends it")
+        status.start(f"ground ({flight.name}): waiting for a vehicle on {address}; Ctrl-C ends it")
         outcome = ends.ground_realtime(
             flight, address, options.run_dir,
             vehicle_system_id=options.system, wing=options.wing, report=status.say, stop=status.stop, progress=None,
@@ -135,9 +137,9 @@ def _ground_fleet(
         Address(first.kind, first.host, first.port + j) if options.link else ends.ground_address(options.instance + j)
         for j in range(links)
     ]
-    status = Status(options.status == "json")
+    status = Status(options.status == "json", options.run_dir)
     where = first if links == 1 else f"{first} to {addresses[-1]}"
-    status.say(
+    status.start(
         f"ground ({flight.name}): waiting for vehicles {system_id} to {system_id + count - 1} on {where}; "
         "Ctrl-C ends it"
     )

@@ -1,16 +1,14 @@
-"""`mavsitl report`, `scenarios` and `chaos`."""
+"""`mavsitl scenarios` and `mavsitl chaos`: lists of what there is."""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from mavsitl.cli.common import EXIT_OK, command, print_json
+from mavsitl.cli.common import EXIT_OK, add_json, command, print_json
 
-if TYPE_CHECKING:
-    pass
-
+WIDE = 100
+"""Columns of a terminal from which on a scenario's command level is listed, too."""
 
 CHAOS_HELP = """\
 List what mavsitl vehicle --chaos makes the vehicle do wrong, for tests of ground stations and SDKs: acknowledgements
@@ -21,34 +19,18 @@ Arguments may be left out from the right; an empty one is the default.
 """
 
 
-def add_report(commands: Any) -> None:
-    parser = command(
-        commands, "report", "draw the report of runs again", "Draw report.html of each run folder again, from its logs."
-    )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run folder, with run.json in it")
-    parser.set_defaults(run=_report)
-
-
 def add_scenarios(commands: Any) -> None:
     parser = command(
         commands, "scenarios", "list the shipped scenarios", "List the shipped scenarios with what they fly."
     )
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    add_json(parser, "the scenarios, each with all its keys,")
     parser.set_defaults(run=_scenarios)
 
 
 def add_chaos(commands: Any) -> None:
     parser = command(commands, "chaos", "list what a vehicle can do wrong on MAVLink", CHAOS_HELP)
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    add_json(parser, "the modes")
     parser.set_defaults(run=_chaos)
-
-
-def _report(options: argparse.Namespace) -> int:
-    from mavsitl.report.html import write_report
-
-    for folder in options.runs:
-        print(write_report(folder))
-    return EXIT_OK
 
 
 def _scenarios(options: argparse.Namespace) -> int:
@@ -58,17 +40,19 @@ def _scenarios(options: argparse.Namespace) -> int:
     if options.json:
         print_json({f.name: f.scenario for f in flights})
         return EXIT_OK
-    from rich.console import Console
-    from rich.table import Table
+    from mavsitl.cli import screen
 
-    table = Table("scenario", "title", "airframe", "wind", "reference", "level")
+    console = screen.console()
+    columns = ["scenario", "title", "airframe", "wind", "reference", "level"]
+    if console.width < WIDE:
+        columns.pop()
+    table = screen.table(*columns, whole=set(columns) - {"title"})
     for flight in flights:
         s = flight.scenario
         wind = " + ".join(str(model.__struct_config__.tag) for model in s.wind) or "calm"
-        table.add_row(
-            flight.name, s.title, s.airframe, wind, str(s.reference.__struct_config__.tag), s.controller.level
-        )
-    Console().print(table)
+        cells = (flight.name, s.title, s.airframe, wind, str(s.reference.__struct_config__.tag), s.controller.level)
+        table.add_row(*cells[: len(columns)])
+    console.print(table)
     return EXIT_OK
 
 
@@ -85,13 +69,11 @@ def _chaos(options: argparse.Namespace) -> int:
         ]  # fmt: skip
         print_json(rows)
         return EXIT_OK
-    from rich.console import Console
-    from rich.table import Table
+    from mavsitl.cli import screen
 
-    console = Console()
+    console = screen.console()
     for group in dict.fromkeys(row.group for row in TABLE.values()):
-        table = Table("mode", "what goes wrong", title=group, title_justify="left", title_style="bold", expand=True)
-        table.columns[0].no_wrap = True
+        table = screen.table("mode", "what goes wrong", title=group, whole=("mode",))
         for name, row in TABLE.items():
             if row.group == group:
                 defaults = ", ".join(f"{each.name} {each.default}" for each in row.arguments if each.default)

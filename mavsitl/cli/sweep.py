@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavsitl.cli.campaigns import add_run_options
-from mavsitl.cli.common import EXIT_FAILED, EXIT_OK, UsageError, command, interrupt, on_signals, print_json
+from mavsitl.cli.campaigns import add_run_options, check_run_options, crew
+from mavsitl.cli.common import (
+    EXIT_FAILED,
+    EXIT_OK,
+    add_json,
+    command,
+    command_line,
+    interrupt,
+    leaving,
+    on_signals,
+    print_json,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -65,37 +73,35 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     group.add_argument("--seeds", default="10", metavar="SEEDS", help="default: 10, which is 1 to 10")
     group = parser.add_argument_group("run")
-    add_run_options(group, "runs/sweep-SCENARIO); flights that it has are not flown again")
+    add_run_options(group, "runs/sweep-SCENARIO; flights that it has are not flown again")
     group.add_argument("--no-report", action="store_true", help="results and tables only")
-    group.add_argument("--json", action="store_true", help="print the summary as JSON and nothing else")
+    add_json(group, "the summary")
     parser.set_defaults(run=_sweep)
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from mavsitl.campaign import optional, sweep
     from mavsitl.campaign.store import Journal
+    from mavsitl.cli import screen
     from mavsitl.clock import utc_stamp
 
     on_signals(interrupt)
-    if options.jobs is not None and options.scheduler is not None:
-        raise UsageError("--jobs: not with --scheduler, whose workers are what they are")
+    check_run_options(options)
     plan = sweep.plan(options.scenario, options.settings, options.compare, options.seeds)
     optional.need("pyarrow")  # before anything flies
-    facts = sweep.metadata(plan, "mavsitl " + shlex.join(sys.argv[1:]), utc_stamp())
+    facts = sweep.metadata(plan, command_line(), utc_stamp())
     name = plan.cases[0].flight.name
     folder: Path = options.output or Path("runs") / f"sweep-{name}"
-    console = Console(stderr=options.json, highlight=False)
+    console = screen.console(stderr=options.json)
     console.print(f"[bold]{name}[/]  {plan}", soft_wrap=True)
     with Journal(folder / sweep.JOURNAL_FILE) as journal:
         known = sweep.known(plan, journal)
         for text in _told(known, len(plan.cases), folder):
-            console.print(text, soft_wrap=True, markup=False)
+            screen.line(console, text)
         missing = len(plan.cases) - known.flown
         if missing:
-            with _crew(options, missing) as crew:
-                _fly_missing(plan, journal, crew, known.flown, folder)
+            with crew(options, missing) as workers:
+                _fly_missing(plan, journal, workers, known.flown, folder)
         rows = sweep.rows(plan, journal)
     results = sweep.save(plan, rows, folder, facts)
     summary = sweep.summary(plan, rows)
@@ -110,23 +116,12 @@ def _sweep(options: argparse.Namespace) -> int:
         _show_sweep(console, summary)
     for what, path in (("results", results), ("report", page)):
         if path is not None:
-            console.print(f"{what + ':':8s} {path}", soft_wrap=True, markup=False)
+            screen.line(console, f"{what + ':':8s} {path}")
     failed = [row for row in rows if row.status == "failed"]
     if failed:
         said = sorted({row.message for row in failed})
-        console.print(f"{len(failed)} of {len(rows)} failed: {said[0]}", soft_wrap=True, markup=False, style="bold red")
+        screen.line(console, f"{len(failed)} of {len(rows)} failed: {said[0]}", "bold red")
     return EXIT_FAILED if failed else EXIT_OK
-
-
-def _crew(options: argparse.Namespace, missing: int) -> Workers:
-    from mavsitl.campaign import workers
-
-    if options.scheduler is None:
-        return workers.local(min(options.jobs or workers.cores(), missing))
-    import logging
-
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong comes as our own error
-    return workers.Dask(options.scheduler)
 
 
 def _told(known: Known, total: int, folder: Path) -> list[str]:
@@ -144,40 +139,24 @@ def _told(known: Known, total: int, folder: Path) -> list[str]:
     return told
 
 
-def _fly_missing(plan: Plan, journal: Journal, crew: Workers, before: int, folder: Path) -> None:
+def _fly_missing(plan: Plan, journal: Journal, workers: Workers, before: int, folder: Path) -> None:
     """With a progress bar on stderr."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
     from mavsitl.campaign import sweep
+    from mavsitl.cli import screen
 
-    console = Console(stderr=True, highlight=False)
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     total, done = len(plan.cases), before
     counts = {"lost": 0, "failed": 0}
-    with Progress(*columns, TextColumn("{task.fields[said]}"), console=console, disable=not console.is_terminal) as bar:
+    with (
+        leaving(lambda: f"{done} of {total} are in {folder}; the same command goes on with the rest"),
+        screen.flights_progress() as bar,
+    ):
         task = bar.add_task("flights", total=total, completed=before, said="")
-        try:
-            for row in sweep.fly(plan, journal, crew):
-                done += 1
-                if not row.flown:
-                    counts[row.status] += 1
-                said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
-                bar.update(task, advance=1, said=said)
-        except BaseException:
-            bar.stop()
-            console.print(
-                f"{done} of {total} are in {folder}; the same command goes on with the rest",
-                soft_wrap=True, markup=False,
-            )  # fmt: skip
-            raise
+        for row in sweep.fly(plan, journal, workers):
+            done += 1
+            if not row.flown:
+                counts[row.status] += 1
+            said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+            bar.update(task, advance=1, said=said)
 
 
 def _print_sweep_json(results: Path, rows: Sequence[Row], summary: Summary) -> None:
@@ -189,9 +168,7 @@ def _print_sweep_json(results: Path, rows: Sequence[Row], summary: Summary) -> N
 
 
 def _show_sweep(console: Console, summary: Summary) -> None:
-    from rich import box
-    from rich.table import Table
-
+    from mavsitl.cli import screen
     from mavsitl.report import sweep_tables
 
     shown = [("medians, 95 % intervals", sweep_tables.cell_header(summary), sweep_tables.cell_rows(summary))]
@@ -199,9 +176,7 @@ def _show_sweep(console: Console, summary: Summary) -> None:
         header, rows = list(sweep_tables.COMPARISON_HEADER), sweep_tables.comparison_rows(summary)
         shown.append(("seed by seed: median difference and ratio, Wilcoxon's p", header, rows))
     for title, header, rows in shown:
-        table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
-        for column in header:
-            table.add_column(column, justify="left" if column in ("", "measure") else "right")
+        table = screen.table(*header, title=title, right=set(header) - {"", "measure"})
         for cells in rows:
             table.add_row(*cells)
         console.print(table)

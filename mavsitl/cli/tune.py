@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import shlex
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavsitl.cli.campaigns import add_run_options
+from mavsitl.cli.campaigns import add_run_options, check_run_options, crew
 from mavsitl.cli.common import (
     EXIT_OK,
     PAPER_SCENARIOS,
-    UsageError,
     above_zero,
+    add_json,
     add_scenario_options,
     command,
+    command_line,
     interrupt,
+    leaving,
     not_negative,
     on_signals,
     overrides_of,
@@ -92,30 +93,19 @@ def add(commands: Any) -> None:
         "--search-seed", type=whole(0, 2**31), default=1, metavar="N", help="of the search itself (default: 1)"
     )
     group = parser.add_argument_group("run")
-    add_run_options(group, "runs/tune-SCENARIO); what is there is gone on with")
-    group.add_argument("--json", action="store_true", help="print tune.json and nothing else")
+    add_run_options(group, "runs/tune-SCENARIO; what is there is gone on with")
+    add_json(group, "what tune.json has")
     parser.set_defaults(run=_tune)
 
 
 def _tune(options: argparse.Namespace) -> int:
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    from mavsitl.campaign import workers
     from mavsitl.campaign.grid import parse_seeds
     from mavsitl.campaign.store import Journal
-    from mavsitl.tune import flights, run
+    from mavsitl.cli import screen
+    from mavsitl.tune import flights, result, run
 
     on_signals(interrupt)
-    if options.jobs is not None and options.scheduler is not None:
-        raise UsageError("--jobs: not with --scheduler, whose workers are what they are")
+    check_run_options(options)
     plan = run.Plan(
         names=tuple(options.scenarios or PAPER_SCENARIOS), settings=overrides_of(settings_of(options)),
         asked=tuple(options.keys), evaluations=options.evaluations, effort_weight=options.effort_weight,
@@ -125,69 +115,70 @@ def _tune(options: argparse.Namespace) -> int:
     tuning = run.begin(plan)
     name = Path(plan.names[0]).stem if len(plan.names) == 1 else "several" if options.scenarios else "paper"
     folder: Path = options.output or Path("runs") / f"tune-{name}"
-    command = "mavsitl " + shlex.join(sys.argv[1:])
-    console = Console(stderr=options.json, highlight=False)
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    bar = Progress(
-        TextColumn("{task.description}"), *columns, TextColumn("{task.fields[said]}"),
-        console=Console(stderr=True, highlight=False),
-    )  # fmt: skip
     each = run.searched(tuning).each
-    jobs = options.jobs or min(workers.cores(), each)
-    crew = workers.Dask(options.scheduler) if options.scheduler else workers.local(jobs)
-    with Journal(folder / "rows.jsonl") as journal, crew, bar:
+    bar = screen.flights_progress()
+    with Journal(folder / "rows.jsonl") as journal, crew(options, each) as workers, bar:
         task = bar.add_task("tune", total=run.flights_of(tuning), said="")
 
         def said(trial: Trial) -> None:
             if trial.number == 0 and trial.score.lost:
                 text = f"the gains to begin with lose {trial.score.lost} of {each} flights: {trial.score.message}"
-                bar.console.print(text, soft_wrap=True, markup=False)
+                screen.line(bar.console, text)
             best = tuning.best.score
             found = "all lost" if best.lost else f"best error {best.error:.4g}, effort {best.effort:.4g}"
             bar.update(task, said=f"{trial.number + 1} tried, {found}")
 
         try:
-            run.carry_out(tuning, flights.kept(journal, crew, lambda: bar.advance(task)), said)
-        except KeyboardInterrupt:
+            with leaving(lambda: f"the same command goes on from {folder}"):
+                run.carry_out(tuning, flights.kept(journal, workers, lambda: bar.advance(task)), said)
+        except KeyboardInterrupt as interrupted:
             bar.stop()
             if tuning.trials:
-                _show_tuning(console, options, tuning, folder, command)
-            console.print(f"interrupted; the same command goes on from {folder}", soft_wrap=True, markup=False)
+                paths = _write(tuning, folder)
+                interrupted.add_note(f"the best so far: {paths[-1]}")
+                if not options.json:
+                    _show(tuning, paths)
             raise
-    return _show_tuning(console, options, tuning, folder, command)
+    paths = _write(tuning, folder)
+    if options.json:
+        print((folder / result.JSON_FILE).read_text("utf-8"), end="")
+    else:
+        _show(tuning, paths)
+    return EXIT_OK
 
 
-def _show_tuning(console: Any, options: argparse.Namespace, tuning: Tuning, folder: Path, command: str) -> int:
-    from rich.markup import escape
-    from rich.table import Table
-
+def _write(tuning: Tuning, folder: Path) -> list[Path]:
+    """The files of what was found, the page last."""
     from mavsitl.report import tune as report
+    from mavsitl.tune import result
+
+    command = command_line()
+    return [*result.write(tuning, folder, command), report.write(tuning, folder, command)]
+
+
+def _show(tuning: Tuning, paths: Sequence[Path]) -> None:
+    from rich.markup import escape
+
+    from mavsitl.cli import screen
     from mavsitl.report.sweep_tables import bounds, probability
     from mavsitl.report.tables import number
     from mavsitl.tune import result
 
-    paths = [*result.write(tuning, folder, command), report.write(tuning, folder, command)]
-    if options.json:
-        print((folder / result.JSON_FILE).read_text("utf-8"), end="")
-        return EXIT_OK
-    table = Table("measure", "seeds", title="before and after", title_justify="left", title_style="bold")
-    for column in ("before", "after", "ratio, seed by seed", "p"):
-        table.add_column(column, justify="right")
+    console = screen.console()
+    numbers = ("before", "after", "ratio, seed by seed", "p")
+    table = screen.table("measure", "seeds", *numbers, title="before and after", right=numbers)
     for row in result.measures(tuning):
         cells = [row.name, row.seeds, number(row.before), number(row.after)]
         if row.paired is not None:
             cells += [bounds(row.paired.ratio), probability(row.paired.p_value)]
         table.add_row(*(escape(cell) for cell in cells))
     console.print(table)
-    table = Table("key", title="gains", title_justify="left", title_style="bold")
-    for column in ("before", "after", "range", ""):
-        table.add_column(column, justify="right")
+    table = screen.table("key", "before", "after", "range", "", title="gains", right=("before", "after", "range"))
     for gain in result.gains(tuning):
         bound = "at its bound" if gain.at_bound else ""
         key = gain.key.replace("[", r"\[")
         table.add_row(key, f"{gain.before:.4g}", f"{gain.after:.4g}", f"{gain.low:.4g} to {gain.high:.4g}", bound)
     console.print(table)
-    console.print(result.verdict(tuning), soft_wrap=True, markup=False)
+    screen.line(console, result.verdict(tuning))
     for path in paths:
-        console.print(str(path), soft_wrap=True, markup=False)
-    return EXIT_OK
+        screen.line(console, str(path))

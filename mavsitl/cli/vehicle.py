@@ -30,6 +30,7 @@ from mavsitl.cli.ends import (
     check_effect,
     check_fleet,
     check_lockstep,
+    tells_logs,
     wish_for_real_time,
 )
 
@@ -124,6 +125,7 @@ def add(commands: Any) -> None:
 
 
 @process.starting()
+@tells_logs
 def _vehicle(options: argparse.Namespace) -> int:
     from mavsitl import ends
 
@@ -154,7 +156,7 @@ def _vehicle(options: argparse.Namespace) -> int:
     wish = wish_for_real_time(options)
     if count := check_fleet(options, system_id):
         return _fleet(options, flight, links, system_id, count, wish)
-    status = Status(options.status == "json")
+    status = Status(options.status == "json", options.run_dir)
     if options.lockstep:
         outcome = ends.vehicle_lockstep(
             flight,
@@ -168,7 +170,7 @@ def _vehicle(options: argparse.Namespace) -> int:
             progress=status.progress,
         )
     else:
-        status.say(
+        status.start(
             f"vehicle {system_id} ({flight.name}): off-board {links.bind}:{links.offboard_port} -> {offboard_remote}, "
             f"ground station {links.bind}:{links.gcs_port} -> {links.gcs_remote[0]}:{links.gcs_remote[1]}; "
             "Ctrl-C ends it"
@@ -241,9 +243,9 @@ def _fleet(
     ):
         if used > 65535:
             raise UsageError(f"{name}: {count} vehicles would need ports up to {used}; allowed: up to 65535")
-    status = Status(options.status == "json")
+    status = Status(options.status == "json", options.run_dir)
     where = "all on one link" if options.one_link else "each further one's ports 1 higher"
-    status.say(
+    status.start(
         f"vehicles {system_id} to {system_id + count - 1} ({flight.name}): "
         f"off-board {first.bind}:{first.offboard_port} -> {host}:{port}, ground station {first.bind}:{first.gcs_port} "
         f"-> {first.gcs_remote[0]}:{first.gcs_remote[1]}, {where}; Ctrl-C ends it"

@@ -12,6 +12,8 @@ import re
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
+from mavsitl.errors import UsageError
+
 __all__ = ["Address", "AddressError", "Kind", "parse_address"]
 
 _ALLOWED = (
@@ -24,7 +26,7 @@ _HOST_AND_PORT = re.compile(r"(?:\[(?P<ipv6>[^\[\]]*)\]|(?P<host>[^:\[\]]*)):(?P
 _HOST_NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?")
 
 
-class AddressError(ValueError):
+class AddressError(UsageError):
     """An endpoint string that is not one; the text quotes it and says what is allowed."""
 
 

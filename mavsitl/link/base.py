@@ -6,6 +6,8 @@ import socket
 from collections.abc import Sequence
 from typing import Protocol, TypeAlias
 
+from mavsitl.errors import MavsitlError
+
 __all__ = ["MAX_RECEIVED", "Link", "LinkError", "LinkSilent", "Source"]
 
 MAX_RECEIVED = 256
@@ -15,7 +17,7 @@ Source: TypeAlias = tuple[str | int, ...]
 """Where a datagram came from, as the link names it: for UDP the socket address, numeric host and port first."""
 
 
-class LinkError(Exception):
+class LinkError(MavsitlError):
     """A link cannot be opened or used. The text names the address and what to change."""
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
+from mavsitl.errors import MavsitlError
 
-class LogError(OSError):
+
+class LogError(MavsitlError, OSError):
     """A log cannot be written or read; the message names the file and the reason."""
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from mavsitl import frames
 from mavsitl.dialect import mavlink
+from mavsitl.errors import MavsitlError
 from mavsitl.log import topics
 from mavsitl.log.topics import Topic
 from mavsitl.log.ulog import MemoryRecorder, read
@@ -24,7 +25,7 @@ VEHICLE_LOG = "vehicle.ulg"
 GROUND_LOG = "ground.ulg"
 
 
-class FlightError(ValueError):
+class FlightError(MavsitlError, ValueError):
     """The logs hold no flight; the message says what is missing."""
 
 

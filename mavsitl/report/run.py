@@ -9,6 +9,7 @@ from typing import Annotated
 import msgspec
 
 import mavsitl
+from mavsitl.errors import MavsitlError
 from mavsitl.keep import replace_file
 from mavsitl.report.metrics import PAPER_TABLES, paper_case
 from mavsitl.scenario import Flight
@@ -16,7 +17,7 @@ from mavsitl.scenario import Flight
 RUN_FILE = "run.json"
 
 
-class RunError(ValueError):
+class RunError(MavsitlError, ValueError):
     """A run's folder is not as it should be; the message names the file and what was expected."""
 
 

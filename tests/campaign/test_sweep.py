@@ -61,8 +61,7 @@ def test_what_is_wrong_is_named_before_anything_flies(
 
 
 def test_a_scheduler_s_address_has_a_form(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["sweep", "hover-wind", "--scheduler", "here:8786"])
+    assert cli.main(["sweep", "hover-wind", "--scheduler", "here:8786"]) == EXIT_USAGE
     assert "'here:8786' is not allowed; allowed: tcp://HOST:PORT" in capsys.readouterr().err
 
 

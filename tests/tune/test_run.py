@@ -131,8 +131,9 @@ def test_ctrl_c_gives_the_best_so_far(
 
     monkeypatch.setattr(flights, "fly_all", interrupted)
     assert cli.main([*ARGUMENTS, "--output", str(tmp_path)]) == 130
-    said = capsys.readouterr().out
-    assert "the same command goes on from" in said
+    said = capsys.readouterr().err
+    assert f"the same command goes on from {tmp_path}" in said
+    assert f"the best so far: {tmp_path / 'report.html'}" in said
     record = json.loads((tmp_path / "tune.json").read_text("utf-8"))
     assert [each["number"] for each in record["trials"]] == [0, 1]
     assert record["held_out"] is None
