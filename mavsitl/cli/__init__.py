@@ -47,6 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if code is None:
             raise
         print(f"mavsitl {options.command}: {error}", file=sys.stderr)
+        if trace := getattr(error, "trace", ""):
+            print(trace, file=sys.stderr)
         return code
 
 
@@ -54,6 +56,7 @@ def _exit_code(error: Exception) -> int | None:
     """Of an error whose text is for the user; None for any other. They are loaded here: most runs have none."""
     from mavsitl.campaign.errors import CampaignError, GridError
     from mavsitl.chaos.table import ChaosError
+    from mavsitl.controllers import ControllerError
     from mavsitl.ends import ExposedError
     from mavsitl.link.address import AddressError
     from mavsitl.link.base import LinkError
@@ -64,7 +67,10 @@ def _exit_code(error: Exception) -> int | None:
     from mavsitl.scenario import ScenarioError
     from mavsitl.wings import WingError
 
-    if isinstance(error, (UsageError, ExposedError, ScenarioError, GridError, ChaosError, AddressError, WingError)):
+    wrong = (
+        UsageError, ExposedError, ScenarioError, GridError, ChaosError, AddressError, WingError, ControllerError,
+    )  # fmt: skip
+    if isinstance(error, wrong):
         return EXIT_USAGE
     failed = (LinkError, LogError, PairError, RealTimeError, RunError, CampaignError)
     return EXIT_FAILED if isinstance(error, failed) else None
