@@ -443,6 +443,9 @@ class Controller(Section, frozen=True):
     """Where the loop closes: q + thrust, body rates + thrust, or U1..U4 over the wire."""
     inner: Literal["stock", "pidnn"] = "stock"
     """Level `attitude` only: the vehicle's stock cascade, or the same PIDNN seated aboard."""
+    own: str = ""
+    """A controller in place of the paper's: an installed one's name, FILE.py:NAME or MODULE:NAME. Of this table then
+    `telemetry` alone has a meaning. Empty: the paper's."""
     wind_information: Literal["oracle", "observer", "none"] = "observer"
     """W_1..W_3 of eqs 19-26: true wind (no real vehicle has it), estimated from telemetry, or 0."""
     telemetry: Literal["odometry", "split"] = "odometry"
@@ -529,6 +532,10 @@ def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
         _override(data, key, value, where)
     scenario = _convert(data, Scenario, where)
     reference = scenario.reference
+    own, colon, name = scenario.controller.own.rpartition(":")
+    if colon and own.endswith(".py") and not Path(own).is_absolute():
+        controller = msgspec.structs.replace(scenario.controller, own=f"{folder / own}:{name}")
+        scenario = msgspec.structs.replace(scenario, controller=controller)
     if isinstance(reference, Waypoints) and not Path(reference.file).is_absolute():
         path = str(folder / reference.file)
         scenario = msgspec.structs.replace(scenario, reference=msgspec.structs.replace(reference, file=path))
@@ -793,6 +800,11 @@ def _check(scenario: Scenario, where: str) -> None:
     if controller.inner == "pidnn" and controller.level != "attitude":
         raise ScenarioError(
             f"{where}: controller.inner: 'pidnn' needs controller.level 'attitude', not '{controller.level}'"
+        )
+    if controller.own and (controller.inner == "pidnn" or controller.wind_information == "oracle"):
+        raise ScenarioError(
+            f"{where}: controller.own: {controller.own!r} makes nothing of controller.inner and "
+            "controller.wind_information; allowed: their defaults"
         )
     fleet = scenario.fleet
     if fleet.collision_m >= fleet.spacing_m:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from mavsitl.errors import UsageError
 
-Group = Literal["mavsitl.vehicle", "mavsitl.ground"]
+Group = Literal["mavsitl.vehicle", "mavsitl.ground", "mavsitl.reference"]
 
 BOOT_GROUP = "mavsitl.boot"
 """``heartbeat(sequence, system_id) -> frame`` of a vehicle, under its own name: what is sent while it is loaded."""
@@ -18,8 +18,10 @@ PARAMETERS_GROUP = "mavsitl.parameters"
 
 VEHICLE_GROUP: Group = "mavsitl.vehicle"
 GROUND_GROUP: Group = "mavsitl.ground"
+REFERENCE_GROUP: Group = "mavsitl.reference"
+"""``reference_for(reference) -> path`` with ``path.sample(time_s)``: where a ground's vehicle is to be."""
 
-_SHIPPED = {VEHICLE_GROUP: "quadrotor", GROUND_GROUP: "paper"}
+_SHIPPED = {VEHICLE_GROUP: "quadrotor", GROUND_GROUP: "paper", REFERENCE_GROUP: "paper"}
 
 
 class WingError(UsageError, LookupError):

@@ -17,6 +17,7 @@ from mavsitl.control.filters import FirstOrder
 from mavsitl.control.inner_loop import InnerLoop
 from mavsitl.control.pid import PositionLoop
 from mavsitl.control.wind_observer import WindObserver
+from mavsitl.controllers import ControllerError
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector, flip_quaternion, flip_vector
 from mavsitl.log.ulog import Recorder
@@ -26,10 +27,11 @@ from mavsitl.scenario import Flight, ScenarioError
 from mavsitl.services.statustext import Joiner
 from mavsitl_ground import cycle
 from mavsitl_ground.cycle import Demand
-from mavsitl_ground.demand import SENDS
+from mavsitl_ground.demand import SENDS, Send
 from mavsitl_ground.observer import Observer
 from mavsitl_ground.record import block
 from mavsitl_ground.reference import reference_for
+from mavsitl_ground.seat import Seat
 from mavsitl_ground.sequence import ENDED, NOW, Handshake, Phase
 
 SYSTEM_ID = 250
@@ -186,11 +188,17 @@ class Ground:
         scenario = flight.scenario
         self.period_us = scenario.rates.control_period_us
         self._scenario = scenario
-        self._send_demand = SENDS[scenario.controller.level]
         self._node = Node(SYSTEM_ID, COMPONENT_ID)
         self._observer = Observer(scenario.controller.telemetry)
-        self._controller = Controller(flight, offset_nwu_m)
         self._report = report
+        self._controller: Controller | Seat
+        self._send_demand: Send
+        if scenario.controller.own:
+            self._controller = Seat(flight, offset_nwu_m, self._on_broken)
+            self._send_demand = self._controller.send
+        else:
+            self._controller = Controller(flight, offset_nwu_m)
+            self._send_demand = SENDS[scenario.controller.level]
         self._texts = Joiner()
         messages = [(message_id, self.period_us) for message_id in STATE_MESSAGES[scenario.controller.telemetry]]
         messages.append((mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, SYS_STATE_INTERVAL_US))
@@ -212,7 +220,8 @@ class Ground:
         self._down_since_us: int | None = None
         self._has_flown = False
         self._heartbeat_us = -HEARTBEAT_INTERVAL_US
-        self._rows = block(recorder, flight, with_weights=self._controller.learns)
+        own = isinstance(self._controller, Seat)
+        self._rows = block(recorder, flight, with_weights=self._controller.learns, own=own)
         self._now_us = 0
         self._due_us = NOW
         """Until then, and until something comes but the state, nothing is to be done but control."""
@@ -385,6 +394,12 @@ class Ground:
             text = f"the vehicle is on the ground, {below_m:.1f} m below its reference"
             handshake.crash(f"{text}, tilted by {degrees(acos(upright)):.0f} deg", now_us)
             self._due_us = NOW
+
+    def _on_broken(self, error: ControllerError) -> None:
+        """A controller of the user's own has failed."""
+        self._report(f"{error}; the vehicle is to land\n{error.trace}".rstrip())
+        self._handshake.fail(str(error), self._now_us)
+        self._due_us = NOW
 
     def _send_command(self, command: int, confirmation: int, params: tuple[float, ...]) -> None:
         system_id, component_id = self._handshake.target or (0, 0)

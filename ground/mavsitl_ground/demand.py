@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 from mavsitl.codec import packer
 from mavsitl.dialect import mavlink
+from mavsitl.frames import Vector
 from mavsitl.node import Node
 from mavsitl_ground.cycle import Demand
 
@@ -49,3 +50,35 @@ def send_torque(node: Node, target: Target, stamp_us: int, demand: Demand) -> No
 
 SENDS: dict[str, Send] = {"attitude": send_attitude, "body_rate": send_rates, "torque": send_torque}
 """By the scenario's command level."""
+
+
+SET_POSITION_TARGET_LOCAL_NED = packer(mavlink.MAVLink_set_position_target_local_ned_message)
+
+_GROUPS = (
+    mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE,
+    mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_VY_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_VZ_IGNORE,
+    mavlink.POSITION_TARGET_TYPEMASK_AX_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_AY_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_AZ_IGNORE,
+)
+
+
+def send_position(
+    node: Node, target: Target, stamp_us: int,
+    position: Vector | None, velocity: Vector | None, acceleration: Vector | None, yaw_rad: float,
+) -> None:  # fmt: skip
+    """What is given of position, velocity, acceleration (NED) and yaw in SET_POSITION_TARGET_LOCAL_NED."""
+    mask = mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+    values: tuple[float, ...] = ()
+    for ignore, each in zip(_GROUPS, (position, velocity, acceleration), strict=True):
+        if each is None:
+            mask |= ignore
+        values += each or (0.0, 0.0, 0.0)
+    node.send(
+        SET_POSITION_TARGET_LOCAL_NED, stamp_us // 1000, *target, mavlink.MAV_FRAME_LOCAL_NED, mask, *values,
+        yaw_rad, 0.0,
+    )  # fmt: skip

@@ -10,15 +10,18 @@ from mavsitl.log import topics
 from mavsitl.log.block import Block, ned
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
-from mavsitl_ground import cycle
+from mavsitl_ground import cycle, seat
 
 _DESIRED = slice(cycle.DESIRED, cycle.DESIRED + 3)
 _BY_NET = [cycle.WEIGHTS + k for k in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
 """From (P, I, D) x (roll, pitch, yaw) to a net after another."""
 
 
-def block(recorder: Recorder, flight: Flight, *, with_weights: bool) -> Block:
-    """Takes the rows that `mavsitl_ground.cycle` fills and makes the topics' of them."""
+def block(recorder: Recorder, flight: Flight, *, with_weights: bool, own: bool = False) -> Block:
+    """Takes the rows that `mavsitl_ground.cycle` fills, or `mavsitl_ground.seat`, and makes the topics' of them.
+
+    `own`: of a controller of the user's, which does not say U_2..U_4, and logs what it likes.
+    """
     airframe = flight.airframe
     # Angular acceleration to U_2, U_3 (forces) and U_4 (torque).
     per_u = np.array(airframe.inertia_kg_m2) / (airframe.arm_m, airframe.arm_m, 1.0)
@@ -34,12 +37,12 @@ def block(recorder: Recorder, flight: Flight, *, with_weights: bool) -> Block:
     columns = [
         (topics.TRAJECTORY_SETPOINT, trajectory),
         (topics.ATTITUDE_SETPOINT, _attitude_setpoint),
-        (topics.CONTROL_DEMAND, control_demand),
+        (topics.OWN_CONTROLLER, lambda v: v[:, seat.OWN :]) if own else (topics.CONTROL_DEMAND, control_demand),
         (topics.LINK_STATUS, lambda v: v[:, cycle.LINK : cycle.LINK + 4]),
     ]
     if with_weights:
         columns.append((topics.PIDNN_WEIGHTS, lambda v: v[:, _BY_NET]))
-    return Block(recorder, cycle.COLUMNS, columns)
+    return Block(recorder, seat.COLUMNS if own else cycle.COLUMNS, columns)
 
 
 def _attitude_setpoint(v: Floats) -> Floats:

@@ -165,6 +165,13 @@ class Handshake:
         self._client.cancel()
         self._enter(Phase.STOP, now_us)
 
+    def fail(self, how: str, now_us: int) -> None:
+        """The controller cannot go on: the vehicle lands, or is disarmed where there is no ground."""
+        if self.phase is Phase.FLY:
+            self.lost = how
+            self._client.cancel()
+            self._enter(Phase.STOP, now_us)
+
     def finish(self, now_us: int) -> None:
         """The flight's time is over."""
         self._enter(Phase.STOP, now_us)

@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias, TypeVar
 
 import msgspec
 
-from mavsitl import drivers, ends, wings
+from mavsitl import controllers, drivers, ends, wings
 from mavsitl.campaign.grid import Case, Labels, source_digest
 from mavsitl.campaign.sums import LOST_M, Six, Sums
 from mavsitl.clock import processor_s
@@ -49,6 +49,8 @@ class Row(msgspec.Struct, frozen=True):
     """Times that the vehicle was in another mode than OFFBOARD during the flight."""
     effort_rad_s: float | None = None
     """What the rotors did for it: RMS of their speeds about each one's mean. None where none was logged."""
+    settling_s: float | None = None
+    """Mean time from each of `sums.events` until the vehicle stays within `sums.SETTLED_M`; None without an event."""
     labels: Labels = {}
     """The case's."""
     scenario_digest: str = ""
@@ -103,7 +105,8 @@ def fly(case: Case) -> Row:
             key=case.key, scenario=case.flight.name, seed=case.seed, status=status,
             time_s=sums.time_s if sums.lost_s is None else sums.lost_s,
             rmse=sums.rmse if status == "flown" else None, largest=sums.largest, weight_range=sums.weight_range,
-            message=message, left_offboard=sums.left_offboard, effort_rad_s=sums.effort_rad_s, labels=case.labels,
+            message=message, left_offboard=sums.left_offboard, effort_rad_s=sums.effort_rad_s,
+            settling_s=sums.settling_s, labels=case.labels,
             scenario_digest=scenario_digest(case.flight), wire_hash=wire.hexdigest(), code=source_digest(),
             cpu_s=processor_s() - started_s,
         )  # fmt: skip
@@ -116,6 +119,9 @@ def fly(case: Case) -> Row:
     said: list[str] = []
     with ExitStack() as stack:
         try:
+            own = case.flight.scenario.controller.own
+            if own and controllers.source_digest(own) != case.controller:
+                return not_flown(case, f"{own}: has changed since this flight was asked for")
             flight = stack.enter_context(_with_waypoints(case))
             vehicle = wings.find(wings.VEHICLE_GROUP)(flight, sums.vehicle, seed=case.seed, lockstep=True)
             ground = wings.find(wings.GROUND_GROUP)(flight, sums.ground, report=said.append)

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 
 import msgspec
 
+from mavsitl import controllers
 from mavsitl.campaign.errors import GridError
 from mavsitl.scenario import Flight, ScenarioError, Waypoints, load
 
@@ -24,8 +25,8 @@ Labels: TypeAlias = dict[str, Any]
 """What tells the cases of a campaign apart, by the scenario's dotted keys; values as in the scenario's file."""
 
 NOT_FLYING = (
-    "report/", "link/", "campaign/", "tune/",
-    "ask.", "check.", "cli.", "clock.", "ends.", "herald.", "keep.", "pair.", "testing.", "__main__",
+    "report/", "link/", "campaign/", "tune/", "score/",
+    "ask.", "check.", "cli/", "clock.", "ends.", "herald.", "keep.", "pair.", "testing.", "__main__",
 )  # fmt: skip
 DECIDING = (
     "link/impaired.py", "link/framing.py", "link/settings.py", "campaign/fly.py", "campaign/sums.py",
@@ -43,10 +44,14 @@ class Case(msgspec.Struct, frozen=True):
     labels: Labels = {}
     waypoints: bytes | None = None
     """What is in the reference's file, where it has one: whoever flies the case need not have the file."""
+    controller: str = ""
+    """`controllers.source_digest` of a controller of the user's: whoever flies the case needs the same file."""
 
 
 def case(flight: Flight, seed: int | None = None, labels: Mapping[str, Any] | None = None) -> Case:
-    """`seed`: None is the scenario's. Raises `ScenarioError` for a file of waypoints that cannot be read."""
+    """`seed`: None is the scenario's. Raises `ScenarioError` for a file of waypoints that cannot be read, and
+    `ControllerError` for a controller that is not found.
+    """
     scenario = flight.scenario
     if seed is None:
         seed = scenario.seed
@@ -58,7 +63,9 @@ def case(flight: Flight, seed: int | None = None, labels: Mapping[str, Any] | No
     digest.update(source_digest().encode())
     digest.update(msgspec.json.encode((scenario, flight.airframe), order="deterministic"))
     digest.update(waypoints or b"")
-    return Case(flight, seed, digest.hexdigest(), dict(labels or {}), waypoints)
+    own = controllers.source_digest(scenario.controller.own) if scenario.controller.own else ""
+    digest.update(own.encode())
+    return Case(flight, seed, digest.hexdigest(), dict(labels or {}), waypoints, own)
 
 
 def _waypoints(file: str) -> bytes:

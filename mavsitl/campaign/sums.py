@@ -15,13 +15,15 @@ import numpy.typing as npt
 from mavsitl.log import topics
 from mavsitl.log.flight import FlightData, FlightError
 from mavsitl.log.ulog import MemoryRecorder
-from mavsitl.scenario import Flight, LinkModel
+from mavsitl.scenario import Flight, Gust, LinkModel, Scenario, Steps
 
 OFFBOARD = 14
 """vehicle_status.nav_state, PX4's number."""
 
 LOST_M = 20.0
 """A position error beyond this is a lost flight."""
+SETTLED_M = 0.1
+"""A vehicle that is nearer than this to its reference, and stays so, has settled."""
 
 Table = dict[str, npt.NDArray[Any]]
 Six = tuple[float, float, float, float, float, float]
@@ -52,6 +54,9 @@ class Sums:
         self._newest: dict[str, Table] = {}
         """The ground's newest row of each topic that is held."""
         self._first_weights = first_weights(flight)
+        self._events = np.array(events(flight.scenario))
+        self._out_s = np.zeros(len(self._events))
+        """When it was last beyond `SETTLED_M` after each event, before the next."""
         self._squares = np.zeros(6)
         self._largest = np.zeros(6)
         self._released_us: int | None = None
@@ -86,9 +91,18 @@ class Sums:
         variance = squares / self.samples - np.square(total / self.samples)
         return sqrt(max(float(np.mean(variance)), 0.0))
 
+    @property
+    def settling_s(self) -> float | None:
+        """Mean time from each event to the last moment, before the next, that the vehicle was beyond `SETTLED_M`."""
+        begun = self._events[self._events < self.time_s]
+        return float(np.mean(np.maximum(self._out_s[: len(begun)] - begun, 0.0))) if len(begun) else None
+
     def collect(self) -> None:
         """Add what was recorded since the last time, and drop it."""
-        vehicle, ground = self.vehicle.take(), self.ground.take()
+        self.add(self.vehicle.take(), self.ground.take())
+
+    def add(self, vehicle: dict[str, Table], ground: dict[str, Table]) -> None:
+        """Rows of both ends, by topic; `vehicle` loses what is joined."""
         land = vehicle.pop(topics.LAND_DETECTED.name, None)
         if self._released_us is None and land is not None and (land["landed"] == 0).any():
             self._released_us = int(land["timestamp"][land["landed"] == 0][0])
@@ -123,6 +137,7 @@ class Sums:
         self.time_s = float(stretch.time_s[count - 1])
         self._squares += np.sum(np.square(errors), axis=0)
         self._largest = np.maximum(self._largest, np.max(np.abs(errors), axis=0))
+        self._add_settling(stretch.time_s[:count], position[:count])
         if stretch.rotor_speed_rad_s is not None:
             self._add_rotors(stretch.rotor_speed_rad_s[:count])
         if stretch.weights is not None:
@@ -133,6 +148,11 @@ class Sums:
             low, high = self.weight_range
             largest = min(float(np.nanmax(ratios)), sys.float_info.max)  # a law that diverges passes it
             self.weight_range = (min(low, float(np.nanmin(ratios))), max(high, largest))
+
+    def _add_settling(self, time_s: npt.NDArray[np.float64], error_m: npt.NDArray[np.float64]) -> None:
+        out_s = time_s[np.linalg.norm(error_m, axis=1) > SETTLED_M]
+        which = np.searchsorted(self._events, out_s, side="right") - 1
+        np.maximum.at(self._out_s, which[which >= 0], out_s[which >= 0])
 
     def _add_rotors(self, speeds: npt.NDArray[np.float64]) -> None:
         """(k, 4), from the stretch's first sample on."""
@@ -157,6 +177,18 @@ class Sums:
         known = rows >= 0
         ground[name] = {column: values[rows[known]] for column, values in table.items()}
         ground[name]["timestamp"] = stamps[known]
+
+
+def events(scenario: Scenario) -> list[float]:
+    """Flight times, in s, at which something happens that a vehicle has to recover from: steps of the reference, gusts,
+    failures, outages of the link. In order, each once.
+    """
+    found = {step.time_s for step in scenario.reference.steps} if isinstance(scenario.reference, Steps) else set()
+    found |= {wind.start_s for wind in scenario.wind if isinstance(wind, Gust)}
+    found |= {each.start_s for each in scenario.failures if each.clock == "flight"}
+    for direction in (scenario.link.to_ground, scenario.link.to_vehicle):
+        found |= {outage.start_s for outage in direction.outages if outage.clock == "flight"}
+    return sorted(time_s for time_s in found if time_s > 0.0)
 
 
 def first_weights(flight: Flight) -> npt.NDArray[np.float64]:

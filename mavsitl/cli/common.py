@@ -176,10 +176,28 @@ def settings_of(options: argparse.Namespace) -> list[str]:
         "controller.law": options.law, "controller.level": options.level,
         "controller.wind_information": options.wind_information, "duration_s": options.duration,
     }  # fmt: skip
+    if getattr(options, "controller", None) is not None:
+        from mavsitl import controllers
+
+        if options.law is not None:
+            raise UsageError("--law: not with --controller, which says the law")
+        chosen = controllers.settings(options.controller)
+        if chosen.get("controller.own") and options.level is not None:
+            raise UsageError("--level: not with a controller of your own, whose demands say the level")
+        named |= chosen
     for key, value in named.items():
         if value is not None:
             settings.append(f'{key}="{value}"' if isinstance(value, str) else f"{key}={value}")
     return settings
+
+
+def add_controller(parser: argparse.ArgumentParser) -> None:
+    """After `add_scenario_options`, of a command that flies."""
+    parser.add_argument(
+        "--controller", metavar="NAME",
+        help="your own controller, FILE.py:NAME or MODULE:NAME, or an installed one: "
+        "pidnn, pid, stock, geometric, indi, ... (controller.own)",
+    )  # fmt: skip
 
 
 def load(name: str, settings: Sequence[str]) -> Flight:

@@ -11,6 +11,7 @@ from mavsitl.cli.common import (
     EXIT_OK,
     PAPER_SCENARIOS,
     UsageError,
+    add_controller,
     add_json,
     add_scenario_options,
     command,
@@ -49,6 +50,7 @@ examples:
   mavsitl fly hover-wind --law pid                   one of them with the plain PID
   mavsitl fly my.toml --seed 7 --level attitude      a file of your own
   mavsitl fly hover-wind --set noise.position_m=0.02 --set offnominal.mass_scale=1.3
+  mavsitl fly spiral-wind --controller my.py:MyController
   mavsitl fly --in-memory                            one process, no sockets, the same bytes
   mavsitl fly formation-spiral --count 9             nine vehicles and their controllers in one process
 """
@@ -60,6 +62,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("scenarios", nargs="*", metavar="SCENARIO", help="a shipped scenario's name or a .toml file")
     add_scenario_options(parser)
+    add_controller(parser)
     group = parser.add_argument_group("run")
     group.add_argument("--run-dir", type=Path, metavar="DIR", help="run folder (default: runs/<UTC time>)")
     group.add_argument("--in-memory", action="store_true", help="both ends in one process, no sockets; the same bytes")
@@ -73,6 +76,7 @@ def add(commands: Any) -> None:
 
 
 def _fly(options: argparse.Namespace) -> int:
+    from mavsitl import controllers
     from mavsitl.cli import screen
     from mavsitl.clock import utc_stamp
     from mavsitl.report import run as runs
@@ -81,6 +85,9 @@ def _fly(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     names = options.scenarios or list(PAPER_SCENARIOS)
     flights = [load(name, settings) for name in names]
+    for flight in flights:
+        if flight.scenario.controller.own:
+            controllers.make(flight)  # before anything is started
     if options.count is not None:
         return _fly_fleet(options, flights)
     created = utc_stamp()
@@ -136,16 +143,22 @@ def _fly_one(
     def move(time_s: float) -> None:
         bar.update(task, completed=max(time_s, 0.0), said=f"{max(time_s, 0.0):5.1f} s")
 
+    def say(text: str) -> None:
+        """A line beside the bar; what has more, a traceback, above it."""
+        bar.update(task, said=text.partition("\n")[0])
+        if "\n" in text:
+            bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
     def on_event(end: str, event: dict[str, Any]) -> None:
         if event["event"] == "progress" and end == "vehicle":
             move(event["flight_time_s"])
         elif event["event"] == "report":
-            bar.update(task, said=event["text"])
+            say(event["text"])
 
     if in_memory:
         from mavsitl import ends
 
-        outcome = ends.in_memory(flight, folder, report=lambda text: bar.update(task, said=text), progress=move)
+        outcome = ends.in_memory(flight, folder, report=say, progress=move)
         if not outcome.finished and not outcome.lost:
             raise pair.PairError(f"{flight.name}: the flight did not end as planned")
         wire_hash, speed, lost = outcome.wire_hash, outcome.speed, outcome.lost

@@ -11,6 +11,7 @@ from mavsitl.cli.common import (
     EXIT_OK,
     SYSTEM,
     UsageError,
+    add_controller,
     add_scenario,
     command,
     endpoint,
@@ -46,6 +47,7 @@ examples:
   mavsitl ground hover-wind                          listens on udpin:127.0.0.1:14540, as PX4's users expect
   mavsitl ground hover-wind --link udpin:0.0.0.0:14540
   mavsitl ground spiral-calm --link udpout:192.0.2.9:14580 --system 3
+  mavsitl ground hover-wind --controller my.py:MyController
   mavsitl ground formation-spiral --count 9          for nine vehicles, at udpin:127.0.0.1:14540 to 14548
 """
 
@@ -53,6 +55,7 @@ examples:
 def add(commands: Any) -> None:
     parser = command(commands, "ground", "start the off-board controller alone", GROUND_HELP, GROUND_EXAMPLES)
     add_scenario(parser, "its controller and reference")
+    add_controller(parser)
     group = parser.add_argument_group("link")
     group.add_argument(
         "--link",

@@ -222,6 +222,9 @@ CONTROL_DEMAND = Topic("control_demand", ("float[4] u", "float[3] wind_accelerat
 LINK_STATUS = Topic("link_status", ("uint32_t received", "uint32_t lost", "uint32_t bad", "uint32_t state_age_us"))
 """Counts since the start: frames received, lost by sequence number, and refused; age of the state used, us."""
 
+OWN_CONTROLLER = Topic("own_controller", ("float[8] value",))
+"""What a controller of the user's own has logged, in its own terms; NaN where it has fewer."""
+
 VEHICLE_TOPICS = (
     LOCAL_POSITION_TRUTH,
     ATTITUDE_TRUTH,
@@ -246,5 +249,5 @@ VEHICLE_TOPICS = (
     ESTIMATOR_STATUS,
     SENSOR_BIAS,
 )
-GROUND_TOPICS = (TRAJECTORY_SETPOINT, ATTITUDE_SETPOINT, CONTROL_DEMAND, PIDNN_WEIGHTS, LINK_STATUS)
+GROUND_TOPICS = (TRAJECTORY_SETPOINT, ATTITUDE_SETPOINT, CONTROL_DEMAND, PIDNN_WEIGHTS, LINK_STATUS, OWN_CONTROLLER)
 TOPICS = tuple(dict.fromkeys(VEHICLE_TOPICS + GROUND_TOPICS))

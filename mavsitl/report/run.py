@@ -12,7 +12,7 @@ import mavsitl
 from mavsitl.errors import MavsitlError
 from mavsitl.keep import replace_file
 from mavsitl.report.metrics import PAPER_TABLES, paper_case
-from mavsitl.scenario import Flight
+from mavsitl.scenario import Controller, Flight
 
 RUN_FILE = "run.json"
 
@@ -79,11 +79,9 @@ def record(
         folder=folder,
         seed=scenario.seed,
         airframe=scenario.airframe,
-        level=scenario.controller.level,
-        law="stock"
-        if scenario.controller.level == "attitude" and scenario.controller.inner == "stock"
-        else scenario.controller.law,
-        wind_information=scenario.controller.wind_information,
+        level="own" if scenario.controller.own else scenario.controller.level,
+        law=_law(scenario.controller),
+        wind_information="own" if scenario.controller.own else scenario.controller.wind_information,
         wire_hash=wire_hash,
         real_time_factor=real_time_factor,
         scenario_digest=scenario_digest(flight),
@@ -94,6 +92,12 @@ def record(
         links=links or {},
         dropped=dropped or {},
     )
+
+
+def _law(controller: Controller) -> str:
+    if controller.own:
+        return controller.own
+    return "stock" if controller.level == "attitude" and controller.inner == "stock" else controller.law
 
 
 def scenario_digest(flight: Flight) -> str:
