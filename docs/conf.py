@@ -14,11 +14,19 @@ author = "the mavsitl developers"
 copyright = "the mavsitl developers, Apache-2.0"  # noqa: A001 (Sphinx's own name)
 version = release = mavsitl.__version__
 
-extensions = ["myst_parser", "generated"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "generated", "equations"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build", "_ext"]
 nitpicky = True
+nitpick_ignore_regex = [
+    ("py:.*", ".*")
+]  # types of signatures: most are other libraries', and no network is asked for them
+napoleon_use_ivar = True
+default_role = "code"  # single backticks of docstrings
+autodoc_member_order = "bysource"
+autodoc_class_signature = "separated"
+autodoc_typehints_format = "short"
 smartquotes = False  # quoted values are TOML
 
 html_theme = "furo"
