@@ -103,7 +103,7 @@ SECTIONS: Mapping[str, Mapping[int, str]] = {
 }
 """The paper's equations in our words, by its sections."""
 
-_NUMBERS = r"\d+(?:-\d+)?(?: \([^()]*\))?"
+_NUMBERS = r"\d+(?:-\d+)?(?: \((?:(?!eq)[^()])*\))?"
 _CITATION = re.compile(rf"\b[Ee]qs?\.? ({_NUMBERS}(?:(?:, | and |, and | to ){_NUMBERS})*)")
 
 

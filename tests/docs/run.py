@@ -104,7 +104,11 @@ class PageRun:
         except tomllib.TOMLDecodeError as error:
             raise BlockError(block, f"no TOML: {error}") from error
         try:
-            if "title" in data and "fragment of" not in block.marks:
+            if "mass_kg" in data:
+                path = self.folder / f"block-{block.line}.toml"
+                path.write_text(block.text, "utf-8")
+                scenario.load_airframe(str(path))
+            elif "title" in data and "fragment of" not in block.marks:
                 path = self.folder / f"block-{block.line}.toml"
                 path.write_text(block.text, "utf-8")
                 scenario.load(str(path))
