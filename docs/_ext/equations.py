@@ -103,6 +103,9 @@ SECTIONS: Mapping[str, Mapping[int, str]] = {
 }
 """The paper's equations in our words, by its sections."""
 
+_ROOTS = re.compile(r"^(?:vehicle/mavsitl_vehicle|ground/mavsitl_ground|mavsitl|tests)/")
+"""Of the packages; the names below them do not repeat but for package files."""
+
 _NUMBERS = r"\d+(?:-\d+)?(?: \((?:(?!eq)[^()])*\))?"
 _CITATION = re.compile(rf"\b[Ee]qs?\.? ({_NUMBERS}(?:(?:, | and |, and | to ){_NUMBERS})*)")
 
@@ -220,7 +223,7 @@ class Equations(SphinxDirective):
                 listed.append(place.name)
         paragraph = nodes.paragraph()
         for index, (path, listed) in enumerate(by_path.items()):
-            short = path.removeprefix("vehicle/").removeprefix("ground/").removeprefix("tests/")
+            short = _ROOTS.sub("", path)
             paragraph += nodes.Text("; " if index else "")
             paragraph += nodes.literal(short, short)
             if listed:
