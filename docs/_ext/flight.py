@@ -42,10 +42,10 @@ class FlightFigure(SphinxDirective):
             data = FlightData.from_folder(Path(folder), duration_s=flight.scenario.duration_s)
         if outcome.lost:
             raise self.error(f"{self.arguments[0]} was lost: {outcome.lost}")
-        error_cm = distance_cm(data)[data.time_s >= SETTLED_S]
+        rms_cm = float(np.sqrt(np.mean(distance_cm(data)[data.time_s >= SETTLED_S] ** 2)))
         said = (
             f"{flight.scenario.title}, {flight.scenario.duration_s:g} s, flown when this page was built. "
-            f"After the first {SETTLED_S:g} s it was {np.sqrt(np.mean(error_cm**2)):.1f} cm RMS from its reference (dashed)."
+            f"After the first {SETTLED_S:g} s it was {rms_cm:.1f} cm RMS from its reference (dashed)."
         )
         return [nodes.raw("", drawing(data, said), format="html"), nodes.caption("", said)]
 

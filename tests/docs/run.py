@@ -201,8 +201,7 @@ class PageRun:
             option = "--listen" if name == "check" else "--endpoint"
             port = running["18570"] if not getattr(options, "gcs", False) else running["14580"]
             address = f"udpout:127.0.0.1:{port}"
-            shortened = ("--for", "1") if name == "check" else ()
-            self.execute(block, command, [*without(arguments, option, "--instance"), option, address, *shortened])
+            self.execute(block, command, [*without(arguments, option, "--instance"), option, address])
         elif name in SHORT:
             self.execute(block, command, [*arguments, *SHORT[name]])
 
