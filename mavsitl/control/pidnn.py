@@ -232,7 +232,7 @@ def net_step(
 
 
 def initial_weights(roll_pitch: Gains, yaw: Gains, period_s: float) -> Floats:
-    """Eq 39: K_P, K_I, K_D of eqs 41, 42 in their discrete sense, (3 outputs, 3 axes), for gains on angular acceleration."""
+    """Eq 39: K_P, K_I, K_D of eqs 41, 42, which are discrete, (3 outputs, 3 axes), for gains on angular acceleration."""
     return np.array(
         [[g.k_p_per_s2, g.k_i_per_s3 * period_s, g.k_d_per_s / period_s] for g in (roll_pitch, roll_pitch, yaw)]
     ).T.copy()
@@ -325,8 +325,8 @@ class Pidnn:
 
     so that one rate moves both layers by comparable shares of their initial values per step (a weight that starts at 0
     stays there). A rate above the bound of eqs 54, 57 is cut to it and counted. Guards: nothing is learned from
-    an error below the dead zone; leakage pulls each weight towards its initial value, also within the dead zone; projection
-    holds it within multiples of that value. Input weights, if learned, have the same guards about +1 and -1.
+    an error below the dead zone; leakage pulls each weight towards its initial value, also within the dead zone;
+    projection holds it within multiples of that value. Input weights, if learned, have the same guards about +1 and -1.
     """
 
     def __init__(
