@@ -232,7 +232,7 @@ def net_step(
 
 
 def initial_weights(roll_pitch: Gains, yaw: Gains, period_s: float) -> Floats:
-    """Eq 39: K_P, K_I, K_D of eqs 41, 42, which are discrete, (3 outputs, 3 axes), for gains on angular acceleration."""
+    """Eq 39: the discrete K_P, K_I, K_D of eqs 41, 42, (3 outputs, 3 axes), for gains on angular acceleration."""
     return np.array(
         [[g.k_p_per_s2, g.k_i_per_s3 * period_s, g.k_d_per_s / period_s] for g in (roll_pitch, roll_pitch, yaw)]
     ).T.copy()
