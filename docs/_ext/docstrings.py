@@ -13,6 +13,8 @@ from sphinx.application import Sphinx
 from sphinx.util.typing import ExtensionMetadata
 
 _ALIAS = re.compile(r"TypeAliasForwardRef\('(\w+)'\)")
+_before: dict[str, list[str]] = {}
+"""Docstrings of attributes, by name, as they are before napoleon."""
 _PYTHONS_OWN = ("Alias for field number", "Create new instance of")
 
 
@@ -22,6 +24,14 @@ def keep_lines(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines:
         indented = len(below) - len(below.lstrip()) > len(line) - len(line.lstrip())
         if line.endswith(":") and not line.endswith("::") and not empty.strip() and below.strip() and indented:
             lines[index] = line + ":"
+    if what in ("attribute", "data", "property"):
+        _before[name] = list(lines)
+
+
+def after_napoleon(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Give an attribute its text back, of which napoleon takes what stands before a colon for a type."""
+    if name in _before:
+        lines[:] = _before.pop(name)
 
 
 def name_aliases(
@@ -39,6 +49,7 @@ def skip(app: Sphinx, what: str, name: str, obj: Any, skipped: bool, options: An
 def setup(app: Sphinx) -> ExtensionMetadata:
     # Before napoleon, which is at 500: its own sections are not yet there.
     app.connect("autodoc-process-docstring", keep_lines, priority=400)
+    app.connect("autodoc-process-docstring", after_napoleon, priority=600)
     app.connect("autodoc-process-signature", name_aliases)
     app.connect("autodoc-skip-member", skip)
     return {"version": "1", "parallel_read_safe": True}
