@@ -15,7 +15,8 @@ from sphinx.util.typing import ExtensionMetadata
 _ALIAS = re.compile(r"TypeAliasForwardRef\('(\w+)'\)")
 _before: dict[str, list[str]] = {}
 """Docstrings of attributes, by name, as they are before napoleon."""
-_PYTHONS_OWN = ("Alias for field number", "Create new instance of")
+_FIELD, _NEW = "Alias for field number", "Create new instance of"
+"""What Python says of a named tuple's fields, and of how one is made."""
 
 
 def keep_lines(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -24,6 +25,8 @@ def keep_lines(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines:
         indented = len(below) - len(below.lstrip()) > len(line) - len(line.lstrip())
         if line.endswith(":") and not line.endswith("::") and not empty.strip() and below.strip() and indented:
             lines[index] = line + ":"
+    if lines and lines[0].startswith(_FIELD):
+        lines.clear()
     if what in ("attribute", "data", "property"):
         _before[name] = list(lines)
 
@@ -43,7 +46,7 @@ def name_aliases(
 
 
 def skip(app: Sphinx, what: str, name: str, obj: Any, skipped: bool, options: Any) -> bool | None:
-    return True if str(getattr(obj, "__doc__", "")).startswith(_PYTHONS_OWN) else None
+    return True if str(getattr(obj, "__doc__", "")).startswith(_NEW) else None
 
 
 def setup(app: Sphinx) -> ExtensionMetadata:
