@@ -119,7 +119,7 @@ def add_inject(commands: Any) -> None:
     parser.add_argument("unit", nargs="?", metavar="UNIT", help="for example gps, motor, battery, mavlink; see --list")
     parser.add_argument("type", nargs="?", metavar="TYPE", help="ok mends it; off, stuck, garbage, wrong, slow, ...")
     parser.add_argument(
-        "instance", nargs="?", type=whole(0, 255), default=0, metavar="INSTANCE", help="1 the first; 0: all (default)"
+        "number", nargs="?", type=whole(0, 255), default=0, metavar="INSTANCE", help="1 the first; 0: all (default)"
     )
     parser.add_argument("--list", action="store_true", help="list the names of units and types")
     _add_ask_options(parser, "udpout:127.0.0.1:18570 + I")
@@ -207,9 +207,9 @@ def _inject(options: argparse.Namespace) -> int:
         if name not in known:
             meant = did_you_mean(name, known)
             raise UsageError(f"{what}: {name!r} is not allowed; {meant}allowed: {', '.join(known)}")
-    params = (float(units[options.unit]), float(kinds[options.type]), float(options.instance))
+    params = (float(units[options.unit]), float(kinds[options.type]), float(options.number))
     reply = _ask(options, ask.CommandTask(mavlink.MAV_CMD_INJECT_FAILURE, *params))
-    which = f" {options.instance}" if options.instance else ""
+    which = f" {options.number}" if options.number else ""
     return _tell(options, reply, lambda: print(f"{options.unit}{which} {options.type}: {reply.result.lower()}"))
 
 

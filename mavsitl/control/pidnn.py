@@ -9,8 +9,9 @@ How the printed slips are resolved (docs: explanation/pidnn):
   and x_2 the measured angle, so that w_1j = +1 and w_2j = -1 (eq 38) give u = e = phi_d - phi.
 - Eq 37 has no value where its denominator vanishes: 0 there, so nothing is learned. The plant's sign is known, +1,
   which is the default.
-- Eq 50 differentiates sqrt(2 E) with a factor 1/2 too many, and eqs 53 and 56 inherit it: with d e / d W = -o delta the
-  bounds of eqs 54 and 57 are 2 / (...)^2, not 8 / (...)^2.
+- Eqs 43-49 bound the rate by the derivative of e. Eq 50 differentiates sqrt(2 E) in its place, with a factor 1/2 too
+  many, which eqs 51-53, 55 and 56 inherit: with d e / d W = -o delta the bounds of eqs 54 and 57 are 2 / (...)^2, not
+  8 / (...)^2.
 """
 
 from __future__ import annotations
@@ -231,7 +232,7 @@ def net_step(
 
 
 def initial_weights(roll_pitch: Gains, yaw: Gains, period_s: float) -> Floats:
-    """Eq 39: K_P, K_I, K_D of eq 42 in its discrete sense, (3 outputs, 3 axes), for gains on angular acceleration."""
+    """Eq 39: the discrete K_P, K_I, K_D of eqs 41, 42, (3 outputs, 3 axes), for gains on angular acceleration."""
     return np.array(
         [[g.k_p_per_s2, g.k_i_per_s3 * period_s, g.k_d_per_s / period_s] for g in (roll_pitch, roll_pitch, yaw)]
     ).T.copy()
@@ -324,8 +325,8 @@ class Pidnn:
 
     so that one rate moves both layers by comparable shares of their initial values per step (a weight that starts at 0
     stays there). A rate above the bound of eqs 54, 57 is cut to it and counted. Guards: nothing is learned from
-    |e| below the dead zone; leakage pulls each weight towards its initial value, also within the dead zone; projection
-    holds it within multiples of that value. Input weights, if learned, have the same guards about +1 and -1.
+    an error below the dead zone; leakage pulls each weight towards its initial value, also within the dead zone;
+    projection holds it within multiples of that value. Input weights, if learned, have the same guards about +1 and -1.
     """
 
     def __init__(

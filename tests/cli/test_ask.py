@@ -99,6 +99,13 @@ def test_a_refusal_is_exit_1_and_names_the_endpoint(asked: Asked, capsys: pytest
 def test_inject_sends_the_command_by_name(asked: Asked, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inject", "motor", "off", "2"]) == 0
     assert asked.command == (420, 101.0, 1.0, 2.0)
+    assert asked.address == "udpout:127.0.0.1:18570"  # INSTANCE is the motor's, not the vehicle's
+    assert main(["inject", "motor", "off", "2", "--instance", "3"]) == 0
+    assert asked.command == (420, 101.0, 1.0, 2.0)
+    assert asked.address == "udpout:127.0.0.1:18573"
+    assert main(["inject", "motor", "off", "2", "--endpoint", "udpout:127.0.0.1:18571"]) == 0
+    capsys.readouterr()
+    assert main(["inject", "motor", "off", "2"]) == 0
     assert capsys.readouterr().out.startswith("motor 2 off: accepted\n")
     assert main(["inject", "rc", "ok"]) == 0
     assert asked.command == (420, 104.0, 0.0, 0.0)

@@ -28,6 +28,7 @@ COMMANDS = (
     "param",
     "sweep",
     "tune",
+    "bench",
     "report",
     "scenarios",
     "chaos",

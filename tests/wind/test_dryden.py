@@ -32,6 +32,7 @@ def sigmas(wind: DrydenPaper | DrydenMil) -> list[float]:
 
 
 def test_table_1() -> None:
+    """Eq 15 at the paper's height and wind."""
     scales = dryden.paper_scales(FIRST_ORDER)
     assert scales.length_m == pytest.approx((7.943, 3.971, 0.5), abs=1.0e-3)
     assert scales.sigma_m_s == pytest.approx((1.995, 3.981, 1.0), abs=1.0e-3)
@@ -136,7 +137,7 @@ def test_the_step_does_not_change_sigma_in_time() -> None:
 
 @pytest.mark.parametrize("wind", [SPECTRUM, FIRST_ORDER])
 def test_welch_spectrum(wind: DrydenPaper) -> None:
-    """Within 8 % of eq 14 (first order: of |G|^2 of eq 17), averaged in bands between 0.4 and 20 rad/s."""
+    """Within 8 % of eq 14 (first order: of eq 16, |G|^2 of eq 17), averaged in bands between 0.4 and 20 rad/s."""
     dt_s, n = 0.02, 256
     samples = blow((wind,), n, dt_s, 8192, seed=3)
     scales = dryden.paper_scales(wind)
