@@ -660,7 +660,7 @@ class CliHelp(GeneratedDirective):
         command = ["mavsitl", *self.arguments, "--help"]
         result = subprocess.run(
             [sys.executable, "-m", *command],
-            env={**os.environ, "COLUMNS": "100", "NO_COLOR": "1"},
+            env={**os.environ, "COLUMNS": "90", "NO_COLOR": "1"},
             stdin=subprocess.DEVNULL,
             capture_output=True,
             encoding="utf-8",
