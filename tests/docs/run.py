@@ -23,6 +23,7 @@ import yaml  # type: ignore[import-untyped]  # MyST brings it, without types
 
 from mavsitl import cli, scenario, testing
 from mavsitl.cli.common import load, settings_of
+from mavsitl.errors import MavsitlError, UsageError
 from tests.docs.blocks import ROOT, Block
 from tests.docs.shell import Command, commands, differs
 
@@ -215,7 +216,7 @@ class PageRun:
     def guarded(self, block: Block, command: Command, call: Callable[[], Any]) -> Any:
         try:
             return call()
-        except (scenario.ScenarioError, SystemExit) as error:
+        except (MavsitlError, SystemExit) as error:
             raise BlockError(block, f"{' '.join(command.words)}: {error}", command.line) from error
 
     def program(self, block: Block, words: Sequence[str]) -> None:
@@ -266,8 +267,9 @@ def parsed(block: Block, command: Command) -> argparse.Namespace:
     try:
         with redirect_stderr(errors):
             return cli.build_parser().parse_args(without_redirection(command.arguments))
-    except SystemExit as error:
-        raise BlockError(block, f"{' '.join(command.words)}\n{errors.getvalue()}", command.line) from error
+    except (UsageError, SystemExit) as error:
+        said = errors.getvalue() or str(error)
+        raise BlockError(block, f"{' '.join(command.words)}\n{said}", command.line) from error
 
 
 def without_redirection(arguments: Sequence[str]) -> list[str]:
