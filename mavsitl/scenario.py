@@ -554,7 +554,7 @@ def _without_none(data: Any) -> Any:
     """A key that is None is one that a file leaves out."""
     if isinstance(data, dict):
         return {key: _without_none(value) for key, value in data.items() if value is not None}
-    return [_without_none(value) for value in data] if isinstance(data, list) else data
+    return [_without_none(value) for value in data] if isinstance(data, list | tuple) else data
 
 
 def text_of(name_or_path: str) -> str:

@@ -49,8 +49,12 @@ def prepare(
         flight = scenario.changed(what, overrides) if overrides else what
     elif isinstance(what, Mapping):
         flight = scenario.load(DEFAULT_SCENARIO, {**what, **(overrides or {})})
-    else:
+    elif isinstance(what, str | Path):
         flight = scenario.load(str(what), dict(overrides or {}))
+    else:
+        raise scenario.ScenarioError(
+            f"a {type(what).__name__} is no scenario; allowed: a name, a path, a table of keys"
+        )
     changed = flight.scenario
     if seed is not None:
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:

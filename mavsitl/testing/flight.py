@@ -67,10 +67,8 @@ class Flight(Craft):
         )
         channels = self._channels["offboard"] = Channels(flight.scenario.link, seed)
         self._subscribe(self.core)
-        tap = Tap(
-            tlog=None if self._logs is None else self._logs.wire, flush=None if self._logs is None else self.flush
-        )
-        self._ticks = drivers.ticks_in_memory(watched, self.ground, channels, tap)
+        self._tap = Tap() if self._logs is None else Tap(tlog=self._logs.wire, flush=self.flush)
+        self._ticks = drivers.ticks_in_memory(watched, self.ground, channels, self._tap)
         self._limit_us = round((flight.scenario.duration_s + ends.IMPAIRED_GRACE_S) * 1e6)
         self._ended = False
         self._trouble = ""
@@ -187,6 +185,11 @@ class Flight(Craft):
     def reported(self) -> tuple[tuple[float, str], ...]:
         """(time_s, line) of what the ground reported: phases, and the STATUSTEXTs that reached it."""
         return tuple(self._reported)
+
+    @property
+    def wire_hash(self) -> str:
+        """Of all bytes that passed between the ends so far: equal flights have equal ones."""
+        return self._tap.wire.hexdigest()
 
     @property
     def data(self) -> FlightData:

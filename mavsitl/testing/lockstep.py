@@ -111,9 +111,7 @@ class Vehicle(Craft):
         for name, place in PORTS.items():
             self._channels[name] = Channels(models[place], flight.scenario.seed, place)
         self._subscribe(self.core)
-        self._tap = Tap(
-            tlog=None if self._logs is None else self._logs.wire, flush=None if self._logs is None else self.flush
-        )
+        self._tap = Tap() if self._logs is None else Tap(tlog=self._logs.wire, flush=self.flush)
         self._inbox: list[Arrived] = []
         self._raw: dict[str, list[bytes]] = {name: [] for name in PORTS}
         self._sequence = dict.fromkeys(PORTS, 0)
