@@ -686,7 +686,7 @@ def members(kind: type[Any]) -> Iterator[tuple[str, Any]]:
             continue
         for name, member in vars(owner).items():
             wanted = inspect.isfunction(member) or isinstance(member, property)
-            if wanted and not name.startswith("_") and name not in seen:
+            if wanted and member.__doc__ and not name.startswith("_") and name not in seen:
                 seen.add(name)
                 yield name, member
 

@@ -233,7 +233,7 @@ def _end(request: pytest.FixtureRequest, craft: Craft) -> None:
 
 @pytest.fixture
 def scenario(request: pytest.FixtureRequest) -> Scenario:
-    """The scenario that `vehicle`, `flight` and `vehicle_udp` fly: by the marker, else by --mavsitl-scenario.
+    """The scenario that `vehicle`, `flight` and `vehicle_udp` fly: by the marker, else by `--mavsitl-scenario`.
 
     A fixture of this name of your own may return a name, a path, a dict of keys, or what `mavsitl.scenario.load` gives.
     """
