@@ -245,13 +245,13 @@ def _lockstep(
 ) -> Callable[[], object]:  # fmt: skip
     if speed != 1.0 or state is not None or logs is not None:
         raise ValueError("in lock-step there is no speed, no state and no logs to download")
-    own, running.offboard_port = free_ports(2)
-    running.offboard_own = own
+    (running.offboard_port,) = free_ports(1)
     link = ConnectedUdp(
-        (LOOPBACK, running.offboard_port), (LOOPBACK, own), timeout_s=drivers.FIRST_REPEAT_S,
+        (LOOPBACK, running.offboard_port), (LOOPBACK, 0), timeout_s=drivers.FIRST_REPEAT_S,
         port_option="a free port", host_option="host",
     )  # fmt: skip
     links.append(link)
+    running.offboard_own = int(link.address[1])
     core = wings.find(wings.VEHICLE_GROUP)(
         running.scenario, running._recording, seed=running.scenario.scenario.seed, lockstep=True
     )
