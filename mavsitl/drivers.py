@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -110,6 +110,9 @@ class GroundCore(Core, Protocol):
     def vehicle_time_us(self) -> int:
         """Stamp of the newest state; -1 before the first."""
 
+
+Exchange = Callable[[int, list[bytes]], tuple[list[bytes], bool]]
+"""Time in us and what is due to the ground; its answer, and whether that is its last."""
 
 Progress = Callable[[float], None]
 """Flight time in seconds, negative before the release."""
@@ -215,12 +218,7 @@ def fly_in_memory(
     tap = tap or Tap()
     throttle = _Throttle(progress)
     if channels is not None:
-        turns = _GroundTurns(ground)
-
-        def exchange(now_us: int, messages: list[bytes]) -> tuple[list[bytes], bool]:
-            return turns.take(messages), ground.finished
-
-        return _fly_impaired(vehicle, channels, exchange, tap, max_time_s, throttle)
+        return _fly_impaired(vehicle, channels, _in_memory(ground), tap, max_time_s, throttle)
     now_us, period_us, last_us = 0, vehicle.period_us, max_time_s * 1e6
     ground_us = chores_us = 0
     hear = tap.hear
@@ -265,20 +263,49 @@ class _GroundTurns:
         return self._ground.datagrams(0, combine=True)
 
 
+def ticks_in_memory(
+    vehicle: VehicleCore, ground: GroundCore, channels: Channels, tap: Tap | None = None
+) -> Iterator[int]:
+    """As `fly_in_memory` over an impaired link, for whoever looks between two ticks, and may stop at any.
+
+    Yields the time of each tick that is over, us. It has no limit but the two ends'. Raises as `fly_in_memory`.
+    """
+    return _impaired_ticks(vehicle, channels, _in_memory(ground), tap or Tap())
+
+
+def _in_memory(ground: GroundCore) -> Exchange:
+    turns = _GroundTurns(ground)
+
+    def exchange(now_us: int, messages: list[bytes]) -> tuple[list[bytes], bool]:
+        return turns.take(messages), ground.finished
+
+    return exchange
+
+
 def _fly_impaired(
     vehicle: VehicleCore,
     channels: Channels,
-    exchange: Callable[[int, list[bytes]], tuple[list[bytes], bool]],
+    exchange: Exchange,
     tap: Tap,
     max_time_s: float,
     throttle: _Throttle,
 ) -> int:
-    """The vehicle's end over an impaired link, in memory and over UDP alike, until both ends have finished.
+    """The vehicle's end over an impaired link, in memory and over UDP alike, until both ends have finished."""
+    now_us, last_us = 0, max_time_s * 1e6
+    for now_us in _impaired_ticks(vehicle, channels, exchange, tap):
+        if now_us >= last_us:
+            raise LockstepError(f"the flight did not end within {max_time_s:g} s of simulated time")
+        throttle(vehicle)
+    return now_us
+
+
+def _impaired_ticks(vehicle: VehicleCore, channels: Channels, exchange: Exchange, tap: Tap) -> Iterator[int]:
+    """The time of each tick that is over.
 
     `exchange` hands over what is due to the ground and returns its answer, and whether that was its last. The tap
     hears what passes between the ends: behind the one channel, before the other.
     """
-    now_us, period_us, last_us = 0, vehicle.period_us, max_time_s * 1e6
+    now_us, period_us = 0, vehicle.period_us
     while True:
         vehicle.step(now_us)
         channels.fly(now_us, vehicle.flight_time_s)
@@ -293,14 +320,13 @@ def _fly_impaired(
             channels.to_vehicle.send(answer, now_us)
         for message in channels.to_vehicle.due(now_us):
             vehicle.receive(0, message)
-        if last and vehicle.finished:
-            return now_us
-        if last:
+        if last and not vehicle.finished:
             raise LockstepError(f"the ground ended at t = {now_us / 1e6:g} s and the vehicle has not disarmed")
-        if now_us >= last_us:
-            raise LockstepError(f"the flight did not end within {max_time_s:g} s of simulated time")
-        tap.tick(now_us)
-        throttle(vehicle)
+        if not last:
+            tap.tick(now_us)
+        yield now_us
+        if last:
+            return
         now_us += period_us
 
 

@@ -10,11 +10,11 @@ import copy
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import msgspec
 
@@ -34,6 +34,9 @@ class ScenarioError(UsageError):
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What all parts of a scenario share: frozen, and strict about unknown keys."""
+
+
+_S = TypeVar("_S", bound=Section)
 
 
 class Rates(Section, frozen=True):
@@ -544,6 +547,24 @@ def load(name_or_path: str, overrides: dict[str, Any] | None = None) -> Flight:
     return Flight(name=name, scenario=scenario, airframe=load_airframe(scenario.airframe, folder))
 
 
+def changed(flight: Flight, overrides: Mapping[str, Any]) -> Flight:
+    """One that is loaded, with other keys over it, as `load` takes them. Raises `ScenarioError`."""
+    data = _without_none(msgspec.to_builtins(flight.scenario))
+    for key, value in copy.deepcopy(dict(overrides)).items():
+        _override(data, key, value, flight.name)
+    scenario = _convert(data, Scenario, flight.name)
+    _check(scenario, flight.name)
+    same = scenario.airframe == flight.scenario.airframe
+    return Flight(flight.name, scenario, flight.airframe if same else load_airframe(scenario.airframe))
+
+
+def _without_none(data: Any) -> Any:
+    """A key that is None is one that a file leaves out."""
+    if isinstance(data, dict):
+        return {key: _without_none(value) for key, value in data.items() if value is not None}
+    return [_without_none(value) for value in data] if isinstance(data, list | tuple) else data
+
+
 def text_of(name_or_path: str) -> str:
     """The scenario's file as it is. Raises `ScenarioError`."""
     return _read("scenarios", name_or_path, names())[0]
@@ -553,6 +574,15 @@ def airframe_names() -> list[str]:
     """The shipped airframes."""
     folder = resources.files("mavsitl") / "airframes"
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def section(kind: type[_S], where: str, keys: Mapping[str, Any]) -> _S:
+    """One table of a scenario from its keys, checked as a file's: ``section(Bursts, "bursts", {"bad_ms": 5.0})``.
+
+    Raises `ScenarioError`, which begins with `where`.
+    """
+    made: _S = _convert(msgspec.to_builtins(dict(keys)), kind, where)
+    return made
 
 
 def load_airframe(name_or_path: str, folder: Path | None = None) -> Airframe:

@@ -19,6 +19,8 @@
     A section for each group of the vehicle's parameters: name, type, default, allowed values, meaning.
 ``{chaos-modes}``
     What a vehicle does wrong on command: a table for each group of modes.
+``{testing-class} NAME``, ``{testing-fixtures}``, ``{testing-options}``
+    Of `mavsitl.testing`: a class out of its docstrings; the plugin's fixtures; its options and its marker.
 ``{cli-help} SUBCOMMAND``
     What ``mavsitl SUBCOMMAND --help`` prints.
 """
@@ -28,6 +30,7 @@ from __future__ import annotations
 import ast
 import inspect
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -48,9 +51,10 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.typing import ExtensionMetadata
 
-from mavsitl import chaos, scenario
+from mavsitl import chaos, scenario, testing
 from mavsitl.dialect import mavlink
 from mavsitl.ends import NullRecorder
+from mavsitl.testing import plugin
 
 UNITS = {
     "hz": "Hz",
@@ -671,6 +675,131 @@ class CliHelp(GeneratedDirective):
         return [nodes.literal_block(result.stdout, result.stdout, language="text")]
 
 
+_ATTRIBUTE = re.compile(r"^    (\w[\w, ]*): (.*)")
+
+
+def members(kind: type[Any]) -> Iterator[tuple[str, Any]]:
+    """What is public of a class, with what it has from ours, in the order of their sources."""
+    seen = set()
+    for owner in kind.__mro__:
+        if not owner.__module__.startswith("mavsitl.testing"):
+            continue
+        for name, member in vars(owner).items():
+            wanted = inspect.isfunction(member) or isinstance(member, property)
+            if wanted and member.__doc__ and not name.startswith("_") and name not in seen:
+                seen.add(name)
+                yield name, member
+
+
+def signature(name: str, function: Any) -> str:
+    """As it is called: names with defaults, without types where the text says them."""
+    parts: list[str] = []
+    parameters = [each for each in inspect.signature(function).parameters.values() if each.name not in ("self", "cls")]
+    starred = False
+    for each in parameters:
+        if each.kind is each.KEYWORD_ONLY and not starred:
+            starred = True
+            parts.append("*")
+        starred = starred or each.kind is each.VAR_POSITIONAL
+        mark = "*" if each.kind is each.VAR_POSITIONAL else "**" if each.kind is each.VAR_KEYWORD else ""
+        default = "" if each.default is each.empty else f"={each.default!r}"
+        parts.append(f"{mark}{each.name}{default}")
+    return f"{name}({', '.join(parts)})"
+
+
+class Documented(GeneratedDirective):
+    def prose(self, text: str | None) -> list[nodes.Node]:
+        """A docstring: paragraphs, programs behind "::", and a list of what stands below "Attributes:"."""
+        found: list[nodes.Node] = []
+        literal = False
+        for block in inspect.cleandoc(text or "").split("\n\n"):
+            if not block.strip():
+                continue
+            if literal and block.startswith("    "):
+                code = inspect.cleandoc(block)
+                if found and isinstance(found[-1], nodes.literal_block):
+                    code = f"{found.pop().astext()}\n\n{code}"
+                found.append(nodes.literal_block(code, code, language="python"))
+                continue
+            literal = block.endswith("::")
+            if block.startswith("Attributes:"):
+                found.append(self.attributes(block.splitlines()[1:]))
+            else:
+                plain = " ".join(block.split())
+                found.append(nodes.paragraph("", "", *self.text(plain.removesuffix(":") if literal else plain)))
+        return found
+
+    def attributes(self, lines: list[str]) -> nodes.Node:
+        rows: list[tuple[str, str]] = []
+        for line in lines:
+            match = _ATTRIBUTE.match(line)
+            if match and not line.startswith("     "):
+                rows.append((match[1], match[2]))
+            else:
+                name, text = rows[-1]
+                rows[-1] = (name, f"{text} {line.strip()}")
+        return self.definitions((name, [nodes.paragraph("", "", *self.text(text))]) for name, text in rows)
+
+    def definitions(self, rows: Any) -> nodes.definition_list:
+        found = nodes.definition_list()
+        for term, content in rows:
+            item = nodes.definition_list_item()
+            item += nodes.term("", "", nodes.literal(term, term))
+            item += nodes.definition("", *content)
+            found += item
+        return found
+
+
+class TestingClass(Documented):
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        name = self.arguments[0]
+        found = getattr(testing, name)
+        if inspect.isfunction(found):
+            return [self.definitions([(signature(name, found), self.prose(found.__doc__))])]
+        content = self.prose(found.__doc__)
+        made = vars(found).get("__init__")
+        if made is not None and made.__doc__:
+            call = signature(name, made)
+            content.append(self.definitions([(call, self.prose(made.__doc__))]))
+        fields = field_docs(found)
+        known = getattr(found, "__annotations__", {})
+        content.append(
+            self.definitions(
+                [(field, self.prose(fields.get(field, ""))) for field in known if fields.get(field)]
+                + [
+                    (each if isinstance(member, property) else signature(each, member), self.prose(member.__doc__))
+                    for each, member in members(found)
+                ]
+            )
+        )
+        return [each for each in content if each.children]
+
+
+class TestingFixtures(Documented):
+    def run(self) -> list[nodes.Node]:
+        rows = []
+        for name in ("scenario", *plugin.CRAFTS, "faults", "assert_flight"):
+            rows.append((name, self.prose(inspect.unwrap(getattr(plugin, name)).__doc__)))
+        return [self.definitions(rows)]
+
+
+class TestingOptions(Documented):
+    def run(self) -> list[nodes.Node]:
+        options = [
+            [self.code(f"--mavsitl-{name}"), self.code(takes), self.code(f"mavsitl_{name}"), self.text(text),
+             self.code(default or "")]
+            for name, takes, text, default in plugin.OPTIONS
+        ]  # fmt: skip
+        marker = [[self.code(name), self.text(text)] for name, text in plugin.MARKER.items()]
+        return [
+            self.table(("option", "takes", "configuration", "what", "default"), options),
+            nodes.paragraph("", "", *self.text("`@pytest.mark.mavsitl(...)` takes, by name:")),
+            self.table(("argument", "what"), marker),
+        ]
+
+
 def setup(app: Sphinx) -> ExtensionMetadata:
     app.add_directive("struct-tables", StructTables)
     app.add_directive("shipped-scenarios", ShippedScenarios)
@@ -686,4 +815,7 @@ def setup(app: Sphinx) -> ExtensionMetadata:
     app.add_directive("parameter-tables", ParameterTables)
     app.add_directive("chaos-modes", ChaosModes)
     app.add_directive("cli-help", CliHelp)
+    app.add_directive("testing-class", TestingClass)
+    app.add_directive("testing-fixtures", TestingFixtures)
+    app.add_directive("testing-options", TestingOptions)
     return {"version": "1", "parallel_read_safe": True}

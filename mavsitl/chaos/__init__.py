@@ -87,6 +87,10 @@ class Chaos:
             each.end(key)
         self._note(f"chaos: {key[0]} on port {key[1]} ends")
 
+    def check(self, mode: str, port: str | None = None) -> None:
+        """Raise what `begin` would of a mode that is none."""
+        self._key(mode, port)
+
     def clear(self) -> None:
         """End all that is on."""
         for mode, port in tuple(self._active):

@@ -297,10 +297,18 @@ class Channels:
         self.to_ground.flight_began_us = self.to_vehicle.flight_began_us = began_us
         if self._changes:
             for change in (*self._by_time.due(now_us / 1e6), *self._by_flight.due(flight_time_s)):
-                for direction, impairment in self._base.items():
-                    if change.direction in ("both", direction):
-                        self._base[direction] = change.of(impairment)
-                self._configure()
+                self.change(change)
+
+    def change(self, change: LinkChange) -> None:
+        """What a scenario's `link.changes` do when their time comes, for what is sent from now on."""
+        for direction, impairment in self._base.items():
+            if change.direction in ("both", direction):
+                self._base[direction] = change.of(impairment)
+        self._configure()
+
+    def base(self, direction: DirectionName) -> Impairment:
+        """What holds of a direction under the parameters' overlay."""
+        return self._base[direction]
 
     def lay_over(self, overlay: Overlay) -> None:
         """The parameters' settings, for what is sent from now on."""

@@ -310,16 +310,34 @@ class _Planned:
 
     def __init__(self, flight: Flight, number: int, lockstep: bool) -> None:
         self.asked: Failure = flight.scenario.failures[number]
-        self.unit = Unit[self.asked.unit.upper()]
-        self.kind = Kind[self.asked.type.upper()]
         self.ends_us = inf
-        where = f"{flight.name}: failures[{number}]"
-        if problem := unsupported(self.unit, self.kind, sensors=has_sensors(flight.scenario)):
-            raise ScenarioError(f"{where}.type: {problem}")
-        if silences(self.unit, self.kind) and not may_fall_silent(flight.scenario, lockstep=lockstep):
-            raise ScenarioError(f"{where}.type: mavlink {self.asked.type}: {NO_SILENCE}")
-        if problem := instance_problem(self.unit, self.asked.instance):
-            raise ScenarioError(f"{where}.instance: {problem}")
-        value = self.asked.value
-        if value is not None and (problem := value_problem(self.unit, self.kind, value)):
-            raise ScenarioError(f"{where}.value: {problem}")
+        try:
+            self.unit, self.kind = understood(self.asked, flight.scenario, lockstep=lockstep)
+        except FailureError as error:
+            raise ScenarioError(f"{flight.name}: failures[{number}].{error.key}: {error}") from None
+
+
+class FailureError(ValueError):
+    """There is no such failure.
+
+    Attributes:
+        key: of the scenario's `[[failures]]`, to which the text refers.
+    """
+
+    def __init__(self, key: str, text: str) -> None:
+        super().__init__(text)
+        self.key = key
+
+
+def understood(asked: Failure, scenario: Scenario, *, lockstep: bool) -> tuple[Unit, Kind]:
+    """What is to fail and how, checked for this vehicle. Raises `FailureError`."""
+    unit, kind = Unit[asked.unit.upper()], Kind[asked.type.upper()]
+    if problem := unsupported(unit, kind, sensors=has_sensors(scenario)):
+        raise FailureError("type", problem)
+    if silences(unit, kind) and not may_fall_silent(scenario, lockstep=lockstep):
+        raise FailureError("type", f"mavlink {asked.type}: {NO_SILENCE}")
+    if problem := instance_problem(unit, asked.instance):
+        raise FailureError("instance", problem)
+    if asked.value is not None and (problem := value_problem(unit, kind, asked.value)):
+        raise FailureError("value", problem)
+    return unit, kind

@@ -16,7 +16,7 @@ from mavsitl.link.budget import Excess
 from mavsitl.link.settings import LinkName, Overlay
 from mavsitl.log.block import Array
 from mavsitl.log.ulog import Recorder
-from mavsitl.scenario import Flight
+from mavsitl.scenario import Failure, Flight
 from mavsitl.signing import SigningMode
 from mavsitl_vehicle import tick
 from mavsitl_vehicle.autopilot.autopilot import Autopilot
@@ -25,7 +25,7 @@ from mavsitl_vehicle.autopilot.modes import Mode
 from mavsitl_vehicle.autopilot.seated import SeatedLaw
 from mavsitl_vehicle.autopilot.setpoints import AttitudeSetpoint, Setpoint
 from mavsitl_vehicle.autopilot.wind_estimate import WindEstimate
-from mavsitl_vehicle.failures import Change, Failures, Kind, Timeline, has_sensors
+from mavsitl_vehicle.failures import Change, Failures, Kind, Timeline, has_sensors, understood
 from mavsitl_vehicle.kept import Kept
 from mavsitl_vehicle.links import LinkControl
 from mavsitl_vehicle.mishaps import Mishaps, ParameterTimeline
@@ -214,6 +214,25 @@ class Vehicle:
     def signed_only(self) -> bool:
         """Every link obeys messages alone that carry a good signature."""
         return self._signing is not None and self._signing.active(self.kept.shared.trusted)
+
+    @property
+    def truth(self) -> Sequence[float]:
+        """Position NWU m, velocity NWU m/s, quaternion FLU -> NWU, omega FLU rad/s, rotor speeds rad/s: 17 numbers."""
+        return self.autopilot.body.truth
+
+    def check_failure(self, failure: Failure) -> None:
+        """Raise ValueError for a failure that this vehicle cannot have."""
+        understood(failure, self._flight.scenario, lockstep=self._lockstep)
+
+    def inject(self, failure: Failure) -> None:
+        """What an entry of the scenario's `[[failures]]` does when its time comes, now; it stays. Raises ValueError."""
+        unit, kind = understood(failure, self._flight.scenario, lockstep=self._lockstep)
+        self.failures.set(unit, kind, failure.instance, failure.value)
+
+    def mend(self, failure: Failure) -> None:
+        """What a failure names is well again. Raises ValueError."""
+        unit, _ = understood(failure, self._flight.scenario, lockstep=self._lockstep)
+        self.failures.set(unit, Kind.OK, failure.instance)
 
     @property
     def weights(self) -> Array | None:
