@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mavsitl import drivers, ends, wings
+from mavsitl import controllers, drivers, ends, wings
 from mavsitl.drivers import LockstepError, Tap
 from mavsitl.link.impaired import Channels
 from mavsitl.log import topics
@@ -46,13 +46,18 @@ class Flight(Craft):
         *,
         seed: int | None = None,
         overrides: Overrides | None = None,
+        controller: str | type | None = None,
         logs: Path | None = None,
     ) -> None:
         """`scenario`: a shipped one's name, a file's path, a table of keys, or one from `mavsitl.scenario.load`.
 
-        `overrides`: keys of the scenario, dotted, over it. `seed`: None is the scenario's. `logs`: a folder for
-        `vehicle.ulg`, `ground.ulg` and `link.tlog`; None: no files. Raises `ScenarioError`.
+        `overrides`: keys of the scenario, dotted, over it. `seed`: None is the scenario's. `controller`: one of your
+        own in the place of the paper's, by class, or by its name as of `mavsitl ground --controller`. `logs`: a folder
+        for `vehicle.ulg`, `ground.ulg` and `link.tlog`; None: no files. Raises `ScenarioError`, `ControllerError`.
         """
+        if controller is not None:
+            name = controller if isinstance(controller, str) else f"{controller.__module__}:{controller.__qualname__}"
+            overrides = {**controllers.settings(name), **(overrides or {})}
         super().__init__(prepare(scenario, seed=seed, overrides=overrides), logs)
         self._variants: list[Flight] = []
         flight = self.scenario

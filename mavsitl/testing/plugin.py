@@ -26,6 +26,7 @@ MARKER = {
     "scenario": "a shipped scenario's name, the path of a .toml file, or a dict of keys",
     "overrides": "a dict of the scenario's keys, dotted, over it",
     "seed": "a whole number",
+    "controller": "of the fixture flight: a class of yours, FILE.py:NAME, MODULE:NAME or an installed one's name",
     "port": '"offboard" or "gcs": the link that the fixture vehicle means where a call names none',
     "speed": "simulated over wall time, of vehicle_udp",
     "lockstep": "True: vehicle_udp waits for the program's answers",
@@ -122,11 +123,11 @@ class _SetupError(Exception):
 @contextmanager
 def _told() -> Generator[None, None, None]:
     """What is wrong with the set-up is told without a traceback: it is the user's."""
-    from mavsitl.scenario import ScenarioError
+    from mavsitl.errors import UsageError
 
     try:
         yield
-    except (ScenarioError, _SetupError) as error:
+    except (UsageError, _SetupError) as error:
         raise pytest.fail.Exception(f"mavsitl: {error}", pytrace=False) from None
 
 
@@ -256,7 +257,8 @@ def flight(request: pytest.FixtureRequest, scenario: Any) -> Iterator[Flight]:
     from mavsitl.testing import Flight
 
     with _told():
-        made = Flight(scenario, logs=_folder(request, "flight"))
+        controller = _marked(request).get("controller")
+        made = Flight(scenario, controller=controller, logs=_folder(request, "flight"))
     _note(request, "flight", made)
     yield made
     _end(request, made)

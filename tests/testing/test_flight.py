@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mavsitl import ends, scenario
+from mavsitl.controllers import AttitudeDemand, ControllerError, Reference, State
 from mavsitl.log.flight import FlightData
 from mavsitl.log.ulog import read
 from mavsitl.report.metrics import PAPER_TABLES, rmse
@@ -140,3 +142,21 @@ def test_keys_over_a_loaded_scenario_are_those_over_its_file() -> None:
         assert scenario.changed(scenario.load(name), overrides) == scenario.load(name, overrides)
     lossy = scenario.load("hover-calm", {"link.changes": [{"at_s": 1.0, "loss": 0.3}]})
     assert scenario.changed(lossy, {"seed": 4}).scenario.link == lossy.scenario.link
+
+
+class Upright:
+    """A controller of a user's."""
+
+    def __init__(self, airframe: Any) -> None:
+        self._weight_n = airframe.weight_n
+
+    def update(self, time_s: float, state: State, reference: Reference) -> AttitudeDemand:
+        return AttitudeDemand.along((0.0, 0.0, self._weight_n), reference.yaw)
+
+
+def test_a_controller_of_the_users_by_class_and_by_name() -> None:
+    by_class = Flight("hover-calm", controller=Upright, overrides=SHORT).run()
+    by_name = Flight("hover-calm", controller=f"{__file__}:Upright", overrides=SHORT).run()
+    assert by_class.wire_hash == by_name.wire_hash != Flight("hover-calm", overrides=SHORT).run().wire_hash
+    with pytest.raises(ControllerError, match="Nobody"):
+        Flight("hover-calm", controller=f"{__file__}:Nobody")

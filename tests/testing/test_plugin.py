@@ -257,7 +257,7 @@ def test_a_scenario_of_ones_own(run: Run, pytester: pytest.Pytester) -> None:
         (
             "scenario='hover-winnd'",
             "flight",
-            "hover-winnd: no such shipped file and not a .toml path; shipped scenarios: *",
+            "hover-winnd: no such shipped file and not a .toml path; did you mean hover-wind*",
         ),
         ("scenario='no.toml'", "flight", "scenario 'no.toml': no such file: neither *"),
         ("scenario=3", "vehicle", "*scenario=3): allowed: a shipped scenario's name, *"),
