@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,9 @@ from mavsitl.log.errors import LogError as LogError
 from mavsitl.log.topics import DATA_MESSAGE, TOPICS, Topic
 from mavsitl.scenario import Flight
 
+if TYPE_CHECKING:
+    from pyulog.core import ULog
+
 MAGIC = b"ULog\x01\x12\x35\x01"
 _BUFFER_BYTES = 1 << 18
 _TEXT_BYTES = 4096
@@ -32,7 +35,7 @@ _DATA_FORMAT = 2
 """PX4's, of the fields' meaning: from 2 on positions are in degrees and metres, as double."""
 _FRAME_DEFAULT = 2
 """Of a default: the airframe's, not the system's."""
-_INFO_TYPES = {
+NUMBERS = {
     "ver_sw_release": ("uint32_t", "<I"),
     "ver_data_format": ("uint32_t", "<I"),
     "time_ref_utc": ("int32_t", "<i"),
@@ -344,6 +347,11 @@ def read(path: Path) -> dict[str, dict[str, npt.NDArray[Any]]]:
 
     Topics without rows are left out. A file that was cut off is read up to the cut. Raises `LogError`.
     """
+    return read_ulog(path)[1]
+
+
+def read_ulog(path: Path) -> tuple[ULog, dict[str, dict[str, npt.NDArray[Any]]]]:
+    """As pyulog has it, and as `read`. Raises `LogError`."""
     from pyulog.core import ULog, ULogException
 
     try:
@@ -351,11 +359,12 @@ def read(path: Path) -> dict[str, dict[str, npt.NDArray[Any]]]:
             log = ULog(file, disable_str_exceptions=False)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ULogException, UnicodeDecodeError) as error:
+    except (ULogException, UnicodeDecodeError, struct.error) as error:
         raise LogError(f"{path}: not a ULog file: {error}") from error
     if log.file_corruption:
-        raise LogError(f"{path}: damaged: a message in it is not valid ULog")
-    return {Topic(dataset.name, (), dataset.multi_id).key: _columns(dataset.data) for dataset in log.data_list}
+        why = "damaged" if log.data_list else "damaged, or cut before the first row"
+        raise LogError(f"{path}: {why}: a message in it is not valid ULog")
+    return log, {Topic(data.name, (), data.multi_id).key: _columns(data.data) for data in log.data_list}
 
 
 def _columns(flat: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
@@ -396,7 +405,7 @@ def information(flight: Flight, boot_us: int | None = None) -> dict[str, str | i
 
 def _information(key: str, value: str | int) -> bytes:
     if isinstance(value, int):
-        kind, code = _INFO_TYPES[key]
+        kind, code = NUMBERS[key]
         return _keyed(f"{kind} {key}", struct.pack(code, value))
     text = value.encode("utf-8")
     return _keyed(f"char[{len(text)}] {key}", text)

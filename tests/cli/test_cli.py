@@ -32,6 +32,7 @@ COMMANDS = (
     "report",
     "scenarios",
     "chaos",
+    "log",
 )
 
 HELP = {
@@ -59,6 +60,7 @@ HELP = {
     "report": ("RUN", "run.json", "report.html"),
     "scenarios": ("--json",),
     "chaos": ("--json", "NAME[:ARGUMENT...][@PORT]", "ack-late:2.5:NAV_TAKEOFF@gcs"),
+    "log": ("info", "convert", "diff", "mavsitl log convert hover hover.ulg"),
 }  # fmt: skip
 
 
@@ -121,7 +123,8 @@ def test_examples_in_the_help_are_accepted_by_the_parser() -> None:
         + cli.check.CHECK_EXAMPLES
         + cli.ask.LINK_EXAMPLES
         + cli.ask.INJECT_EXAMPLES
-        + cli.ask.PARAM_EXAMPLES,
+        + cli.ask.PARAM_EXAMPLES
+        + cli.log.LOG_EXAMPLES,
         re.M,
     )
     assert len(examples) >= 30

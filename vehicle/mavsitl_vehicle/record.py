@@ -343,7 +343,8 @@ def _flags(commander: Commander) -> tuple[int, ...]:
         not now.attitude_valid, not now.height_valid, not now.position_valid, not now.velocity_valid,
         not now.position_valid, now.mission_refusal is not None, not commander.stream_fresh(),
         not commander.home_set, not commander.sticks_fresh(), not commander.gcs_fresh(), now.battery_level,
-        now.fence_breach is not None, now.mission_failure is not None, now.motor_failure != 0,
+        now.fence_breach is not None, commander.mode is modes.Mode.MISSION and now.mission_failure is not None,
+        now.motor_failure != 0,
     )  # fmt: skip
 
 
