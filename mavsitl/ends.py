@@ -14,7 +14,7 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mavsitl import __version__, drivers, fleet, process, realtime, wings
+from mavsitl import drivers, fleet, process, realtime, wings
 from mavsitl.clock import monotonic_us, unix_us
 from mavsitl.drivers import Progress, RealTime, Tap
 from mavsitl.errors import UsageError
@@ -185,9 +185,9 @@ class _LiveLinks:
 
 @contextmanager
 def _logs(
-    folder: Path | None, end: End, flight: Flight, failed: Failed | None = None
+    folder: Path | None, end: End, flight: Flight, failed: Failed | None = None, *, boot_us: int | None = None
 ) -> Iterator[tuple[Recorder, Tap]]:
-    """Recorder and tap of an end. Without a folder the rows are dropped as they come.
+    """Recorder and tap of an end. Without a folder the rows are dropped as they come. `boot_us`: see `information`.
 
     With `failed` the logs are of an end that outlives them: a full disk ends the log and not the flight, and the logs
     of an earlier process in this folder are kept beside the new ones.
@@ -198,7 +198,7 @@ def _logs(
     # Here, for they load numpy: a vehicle is heard before that.
     from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
     from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS
-    from mavsitl.log.ulog import UlogWriter
+    from mavsitl.log.ulog import UlogWriter, information
 
     name, topics = (VEHICLE_LOG, VEHICLE_TOPICS) if end == "vehicle" else (GROUND_LOG, GROUND_TOPICS)
     try:
@@ -209,8 +209,8 @@ def _logs(
         _keep_older(folder / name)
         if end == "vehicle":
             _keep_older(folder / WIRE_LOG)
-    info = {"sys_name": "mavsitl", "ver_sw": __version__, "scenario": flight.name}
-    parameters = flight.airframe.parameters | flight.scenario.parameters
+    info = information(flight, boot_us)
+    parameters = {} if end == "vehicle" else flight.airframe.parameters | flight.scenario.parameters
     with UlogWriter(folder / name, info, parameters, topics=topics, failed=failed) as writer:
         tlog = TlogWriter(folder / WIRE_LOG, failed) if end == "vehicle" else None
         try:
@@ -254,6 +254,12 @@ class NullRecorder:
         return _NullRows()
 
     def message(self, timestamp_us: int, level: int, text: str) -> None:
+        pass
+
+    def begin(self, parameters: Any, defaults: Any) -> None:
+        pass
+
+    def parameter(self, name: str, value: float) -> None:
         pass
 
     def attach(self, drain: Callable[[], None]) -> None:
@@ -426,12 +432,13 @@ def vehicle_realtime(
             # A vehicle that misbehaves does so from its first word: nobody speaks for it.
             boot = None if flight.scenario.chaos else wings.find_boot(wing)
             with Herald(boot, system_id, opened) as herald:
-                recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight, log_failed))
+                unix_clock = _steady_unix_clock()
+                recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight, log_failed, boot_us=unix_clock()))
                 build = wings.find(wings.VEHICLE_GROUP, wing)
                 core = build(
                     flight, recorder, seed=flight.scenario.seed, system_id=system_id,
                     ports=("offboard", *["gcs"] * (len(opened) - 1)), lockstep=False,
-                    state=state, logs=folder, unix_us=_steady_unix_clock(), trusted=is_loopback(links.bind),
+                    state=state, logs=folder, unix_us=unix_clock, trusted=is_loopback(links.bind),
                 )  # fmt: skip
             live.flight_time_s = lambda: core.flight_time_s
             _subscribe(core, live.listen)
@@ -560,12 +567,15 @@ def fleet_realtime(
             opened.append(group)
             stack.callback(_close_all, group)  # the list, for its elements are replaced
         folders = [_fleet_folder(folder, system_id - 1 + j) for j in range(count)]
-        logs = [stack.enter_context(_logs(each, "vehicle", flight, log_failed)) for each in folders]
+        unix_clock = _steady_unix_clock()
+        logs = [
+            stack.enter_context(_logs(each, "vehicle", flight, log_failed, boot_us=unix_clock())) for each in folders
+        ]
         core = _many(
             wings.find(wings.VEHICLE_GROUP, wing), flight, [recorder for recorder, _ in logs], count=count,
             seed=flight.scenario.seed, system_id=system_id, one_link=one_link,
             ports=("offboard", *["gcs"] * (len(opened[0]) - 1)), states=states, logs=folders,
-            unix_us=_steady_unix_clock(), trusted=is_loopback(links[0].bind),
+            unix_us=unix_clock, trusted=is_loopback(links[0].bind),
         )  # fmt: skip
         per_group = len(opened[0])
         ports = _Ports(opened)

@@ -21,6 +21,8 @@
     What a vehicle does wrong on command: a table for each group of modes.
 ``{testing-class} NAME``, ``{testing-fixtures}``, ``{testing-options}``
     Of `mavsitl.testing`: a class out of its docstrings; the plugin's fixtures; its options and its marker.
+``{log-topics} END``
+    The ULog topics that the vehicle, or the ground, writes: fields, when there is a row, what it says.
 ``{cli-help} SUBCOMMAND``
     What ``mavsitl SUBCOMMAND --help`` prints.
 """
@@ -54,6 +56,7 @@ from sphinx.util.typing import ExtensionMetadata
 from mavsitl import chaos, scenario, testing
 from mavsitl.dialect import mavlink
 from mavsitl.ends import NullRecorder
+from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS, Topic
 from mavsitl.testing import plugin
 
 UNITS = {
@@ -657,8 +660,28 @@ def size_text(size: failures.Size) -> str:
     return f"{size.minimum:g} to {size.maximum:g}; without one {size.default:g}: {size.text(size.default)}"
 
 
+class LogTopics(GeneratedDirective):
+    """`log.topics`; topics that differ by their number, or by their link, are one row."""
+
+    ENDS: ClassVar[dict[str, tuple[Topic, ...]]] = {"vehicle": VEHICLE_TOPICS, "ground": GROUND_TOPICS}
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        groups: dict[tuple[object, ...], list[Topic]] = {}
+        for topic in self.ENDS[self.arguments[0]]:
+            groups.setdefault((topic.fields, topic.text, topic.rate), []).append(topic)
+        rows = []
+        for alike in groups.values():
+            first = alike[0]
+            names = ", ".join(f"`{name}`" for name in dict.fromkeys(topic.name for topic in alike))
+            fields = ", ".join(f"`{name}[{count}]`" if count else f"`{name}`" for name, _, count in first.columns[1:])
+            what = f"{first.text} {fields}" if first.text else fields
+            rows.append([self.text(names), self.text(first.rate), self.text(what)])
+        return [self.table(("topic", "rows", "what, and fields"), rows)]
+
+
 class CliHelp(GeneratedDirective):
-    optional_arguments = 1
+    optional_arguments = 2
 
     def run(self) -> list[nodes.Node]:
         command = ["mavsitl", *self.arguments, "--help"]
@@ -814,6 +837,7 @@ def setup(app: Sphinx) -> ExtensionMetadata:
     app.add_directive("failures", FailureTable)
     app.add_directive("parameter-tables", ParameterTables)
     app.add_directive("chaos-modes", ChaosModes)
+    app.add_directive("log-topics", LogTopics)
     app.add_directive("cli-help", CliHelp)
     app.add_directive("testing-class", TestingClass)
     app.add_directive("testing-fixtures", TestingFixtures)

@@ -46,6 +46,9 @@ def block(recorder: Recorder, flight: Flight, *, with_weights: bool, own: bool =
 
 
 def _attitude_setpoint(v: Floats) -> Floats:
-    """phi_d, theta_d, psi_d in FRD and PX4's thrust_body, (k, 6)."""
+    """phi_d, theta_d, psi_d in FRD, PX4's thrust_body, and the same attitude FRD -> NED, (k, 11)."""
     zero = np.zeros(len(v))
-    return np.column_stack((*flip_euler(*v[:, _DESIRED].T), zero, zero, -v[:, cycle.THRUST]))
+    roll, pitch, yaw = flip_euler(*v[:, _DESIRED].T)
+    (a, b, c), (i, j, k) = np.cos([0.5 * roll, 0.5 * pitch, 0.5 * yaw]), np.sin([0.5 * roll, 0.5 * pitch, 0.5 * yaw])
+    quaternion = (a * b * c + i * j * k, i * b * c - a * j * k, a * j * c + i * b * k, a * b * k - i * j * c)
+    return np.column_stack((roll, pitch, yaw, zero, zero, -v[:, cycle.THRUST], *quaternion, zero))

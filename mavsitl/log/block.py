@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,18 @@ Array: TypeAlias = NDArray[np.float64]
 Split: TypeAlias = Callable[[Array], Array]
 """From the gathered rows (k, width) to a topic's values (k, fields flat)."""
 
-BLOCK_ROWS = 250
+BLOCK_ROWS = 320
+"""More than the rows between two flushes of a flight in lock-step at 250 Hz, so that these are what hands over."""
+
+
+class Group(NamedTuple):
+    """Topics that take the same of the gathered rows."""
+
+    topics: Sequence[tuple[Topic, Split]]
+    when: Callable[[Array], NDArray[np.bool_]] | None = None
+    """Of the gathered rows (k, width): which (k,) there is a row of; None: all."""
+    every_us: int = 0
+    """The first row of each such stretch of time alone; 0: all."""
 
 
 class Block:
@@ -43,21 +54,32 @@ class Block:
         """Hand over what was gathered."""
         count, self._count = self._count, 0
         if count:
-            for rows, split in self._targets:
-                rows.extend(self._stamps[:count], split(self._values[:count]))
+            with np.errstate(over="ignore"):
+                for rows, split in self._targets:
+                    rows.extend(self._stamps[:count], split(self._values[:count]))
 
 
 class Window:
     """As `Block`, of rows that something else keeps, a kernel say: what `take` is told of."""
 
     def __init__(
-        self, recorder: Recorder, topics: Sequence[tuple[Topic, Split]], newest: Callable[[int], Array]
+        self, recorder: Recorder, groups: Sequence[Group], newest: Callable[[int], Array], period_us: int
     ) -> None:
-        """`newest(k)` gives the last k rows (k, width), the oldest first; k is at most `BLOCK_ROWS`."""
+        """`newest(k)` gives the last k rows (k, width), the oldest first; k is at most `BLOCK_ROWS`.
+
+        `period_us` is between two rows.
+        """
         self._newest = newest
+        self._period_us = period_us
         self._stamps: list[int] = []
-        self._targets = _targets(recorder, topics)
+        self._drained_us = 0
+        self._groups = [(group, _targets(recorder, group.topics)) for group in groups] if recorder.keeps else []
         recorder.attach(self.drain)
+
+    @property
+    def newest_us(self) -> int:
+        """Of the last row; 0 before the first."""
+        return self._stamps[-1] if self._stamps else self._drained_us
 
     def take(self, timestamp_us: int) -> None:
         """There is one more row."""
@@ -68,11 +90,24 @@ class Window:
 
     def drain(self) -> None:
         """Hand over what was taken."""
-        stamps, self._stamps = self._stamps, []
-        if stamps and self._targets:
-            times, values = np.array(stamps, dtype=np.uint64), self._newest(len(stamps))
-            for rows, split in self._targets:
-                rows.extend(times, split(values))
+        stamps = self._stamps
+        if not stamps:
+            return
+        self._stamps, self._drained_us = [], stamps[-1]
+        if not self._groups:
+            return
+        times, values = np.array(stamps, dtype=np.uint64), self._newest(len(stamps))
+        with np.errstate(over="ignore"):
+            for group, targets in self._groups:
+                taken_times, taken = times, values
+                if group.every_us:
+                    due = taken_times % group.every_us < self._period_us
+                    taken_times, taken = taken_times[due], taken[due]
+                if group.when is not None and not (chosen := group.when(taken)).all():
+                    taken_times, taken = taken_times[chosen], taken[chosen]
+                if len(taken):
+                    for rows, split in targets:
+                        rows.extend(taken_times, split(taken))
 
 
 def _targets(recorder: Recorder, topics: Sequence[tuple[Topic, Split]]) -> list[tuple[Rows, Split]]:

@@ -6,23 +6,41 @@ ULog is PX4's log format (docs.px4.io, "ULog File Format"): definitions, then me
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from mavsitl import __version__
 from mavsitl.log.errors import Failed
 from mavsitl.log.errors import LogError as LogError
 from mavsitl.log.topics import DATA_MESSAGE, TOPICS, Topic
+from mavsitl.scenario import Flight
+
+if TYPE_CHECKING:
+    from pyulog.core import ULog
 
 MAGIC = b"ULog\x01\x12\x35\x01"
 _BUFFER_BYTES = 1 << 18
 _TEXT_BYTES = 4096
+_RELEASE = 255
+"""PX4's type of a version that is no alpha, beta or candidate."""
+_DATA_FORMAT = 2
+"""PX4's, of the fields' meaning: from 2 on positions are in degrees and metres, as double."""
+_FRAME_DEFAULT = 2
+"""Of a default: the airframe's, not the system's."""
+NUMBERS = {
+    "ver_sw_release": ("uint32_t", "<I"),
+    "ver_data_format": ("uint32_t", "<I"),
+    "time_ref_utc": ("int32_t", "<i"),
+    "boot_time_utc_us": ("uint64_t", "<Q"),
+}
 _FLOAT_MAX = float(np.finfo(np.float32).max)
 
 
@@ -47,7 +65,7 @@ class _Sink:
 class Rows:
     """Where one topic's rows go. Packs straight into the buffer: no object is kept per row."""
 
-    __slots__ = ("_body", "_id", "_pack_into", "_sink", "_size", "topic")
+    __slots__ = ("_body", "_header", "_id", "_pack_into", "_sink", "_size", "topic")
 
     def __init__(self, topic: Topic, message_id: int, sink: _Sink) -> None:
         self.topic = topic
@@ -56,6 +74,7 @@ class Rows:
         self._size = topic.message.size
         self._body = self._size - 3
         self._pack_into = topic.message.pack_into
+        self._header = topic.header(message_id)
 
     def append(self, timestamp_us: int, *values: float) -> None:
         """One row; `values` are the topic's fields, arrays flat. A float beyond float32's range is logged as infinite.
@@ -77,12 +96,11 @@ class Rows:
 
     def extend(self, timestamps_us: npt.NDArray[np.uint64], values: npt.NDArray[np.float64]) -> None:
         """k rows: `timestamps_us` (k,), `values` (k, the topic's fields flat). As k times `append`."""
-        rows = self.topic.pack(self._id, timestamps_us, values)
-        sink = self._sink
-        if sink.offset + len(rows) > sink.capacity:
-            sink.make_room(len(rows))
-        sink.buffer[sink.offset : sink.offset + len(rows)] = rows
-        sink.offset += len(rows)
+        sink, size = self._sink, self._size * len(timestamps_us)
+        if sink.offset + size > sink.capacity:
+            sink.make_room(size)
+        self.topic.pack_into(sink.buffer, sink.offset, self._header, timestamps_us, values)
+        sink.offset += size
 
 
 class Recorder(Protocol):
@@ -98,6 +116,12 @@ class Recorder(Protocol):
     def message(self, timestamp_us: int, level: int, text: str) -> None:
         """A line of text; `level` is MAV_SEVERITY, 0 (emergency) to 7 (debug)."""
 
+    def begin(self, parameters: Mapping[str, float], defaults: Mapping[str, float]) -> None:
+        """Before the first `topic`, `message` or `parameter`: all values in force, and what is their default here."""
+
+    def parameter(self, name: str, value: float) -> None:
+        """It was changed, after the newest row."""
+
     def attach(self, drain: Callable[[], None]) -> None:
         """`drain` is called before the rows are read, flushed or closed: for those who gather rows first."""
 
@@ -112,6 +136,10 @@ class MemoryRecorder:
         self._drains: list[Callable[[], None]] = []
         self.messages: list[tuple[int, int, str]] = []
         """(timestamp us, level, text)"""
+        self.parameters: dict[str, float] = {}
+        """As they began."""
+        self.changes: list[tuple[str, float]] = []
+        """Of parameters, since."""
 
     def topic(self, topic: Topic) -> Rows:
         known = self._rows.get(topic.key)
@@ -124,6 +152,12 @@ class MemoryRecorder:
 
     def message(self, timestamp_us: int, level: int, text: str) -> None:
         self.messages.append((timestamp_us, level, text))
+
+    def begin(self, parameters: Mapping[str, float], defaults: Mapping[str, float]) -> None:
+        self.parameters = dict(parameters)
+
+    def parameter(self, name: str, value: float) -> None:
+        self.changes.append((name, value))
 
     def attach(self, drain: Callable[[], None]) -> None:
         self._drains.append(drain)
@@ -208,10 +242,11 @@ class _FileSink(_Sink):
 
 
 class UlogWriter:
-    """Writes a ULog file: definitions and subscriptions at once, then rows in the order in which they came.
+    """Writes a ULog file: definitions at once, subscriptions with what comes first, then rows in the order in which
+    they came.
 
-    `info` holds strings (PX4's keys: sys_name, ver_sw, ...); `parameters` are logged as float, an int value as int32_t;
-    `topics` are those that may be asked for. Raises `LogError` when the file cannot be written.
+    `info` holds texts and numbers by PX4's keys (sys_name, ver_sw, ...); `parameters` are logged as float, an int value
+    as int32_t; `topics` are those that may be asked for. Raises `LogError` when the file cannot be written.
     """
 
     keeps = True
@@ -219,7 +254,7 @@ class UlogWriter:
     def __init__(
         self,
         path: Path,
-        info: Mapping[str, str],
+        info: Mapping[str, str | int],
         parameters: Mapping[str, float],
         *,
         topics: Iterable[Topic] = TOPICS,
@@ -232,35 +267,57 @@ class UlogWriter:
         self._drains: list[Callable[[], None]] = []
         parts = [MAGIC + struct.pack("<Q", start_us), _message("B", bytes(40))]
         parts += [_message("F", text.encode("ascii")) for text in dict.fromkeys(topic.ulog_format for topic in asked)]
-        for key, text in info.items():
-            value = text.encode("utf-8")
-            parts.append(_message("I", _keyed(f"char[{len(value)}] {key}", value)))
-        for key, number in parameters.items():
-            if isinstance(number, int):
-                parts.append(_message("P", _keyed(f"int32_t {key}", struct.pack("<i", number))))
-            else:
-                parts.append(_message("P", _keyed(f"float {key}", struct.pack("<f", number))))
-        for message_id, topic in enumerate(asked):
-            parts.append(_message("A", struct.pack("<BH", topic.instance, message_id) + topic.name.encode("ascii")))
+        parts += [_message("I", _information(key, value)) for key, value in info.items()]
+        parts += [_message("P", _parameter(*each)) for each in parameters.items()]
         self._sink = _FileSink(path, _BUFFER_BYTES, failed)
         self._rows = {topic.key: Rows(topic, message_id, self._sink) for message_id, topic in enumerate(asked)}
+        self._subscribed = False
         self._sink.write(b"".join(parts))
         self._sink.drain()
 
+    def begin(self, parameters: Mapping[str, float], defaults: Mapping[str, float]) -> None:
+        """As in PX4's logs a default is written where it is not the value."""
+        if self._subscribed:
+            raise ValueError("parameters begin before the first row")
+        parts = [_message("P", _parameter(*each)) for each in parameters.items()]
+        others = ((name, value) for name, value in defaults.items() if parameters.get(name) != value)
+        parts += [_message("Q", bytes([_FRAME_DEFAULT]) + _parameter(*each)) for each in others]
+        self._sink.write(b"".join(parts))
+
+    def parameter(self, name: str, value: float) -> None:
+        """Readers take the newest row's time for it, so those that wait go first."""
+        self._subscribe()
+        for drain in self._drains:
+            drain()
+        self._sink.write(_message("P", _parameter(name, value)))
+
+    def _subscribe(self) -> None:
+        """Here the definitions end."""
+        if self._subscribed:
+            return
+        self._subscribed = True
+        for message_id, rows in enumerate(self._rows.values()):
+            head = struct.pack("<BH", rows.topic.instance, message_id)
+            self._sink.write(_message("A", head + rows.topic.name.encode("ascii")))
+        self._sink.drain()  # so that a kill leaves them whole
+
     def topic(self, topic: Topic) -> Rows:
+        self._subscribe()
         rows = self._rows.get(topic.key)
-        if rows is None or rows.topic != topic:
+        if rows is None or (rows.topic is not topic and rows.topic != topic):
             raise ValueError(f"{topic.name}: not among the topics that this file was opened with")
         return rows
 
     def message(self, timestamp_us: int, level: int, text: str) -> None:
         if not 0 <= level <= 7:
             raise ValueError(f"level {level}: 0 (emergency) to 7 (debug) is allowed")
+        self._subscribe()
         body = text.encode("utf-8")[:_TEXT_BYTES].decode("utf-8", "ignore").encode("utf-8")
         self._sink.write(_message("L", struct.pack("<BQ", ord("0") + level, timestamp_us) + body))
 
     def flush(self) -> None:
         """Hand the rows to the system, which keeps them whatever becomes of the process."""
+        self._subscribe()
         for drain in self._drains:
             drain()
         self._sink.drain()
@@ -270,6 +327,7 @@ class UlogWriter:
 
     def close(self) -> None:
         """Write what is left. More than once is harmless."""
+        self._subscribe()
         drains, self._drains = self._drains, []
         for drain in drains:
             drain()
@@ -289,6 +347,11 @@ def read(path: Path) -> dict[str, dict[str, npt.NDArray[Any]]]:
 
     Topics without rows are left out. A file that was cut off is read up to the cut. Raises `LogError`.
     """
+    return read_ulog(path)[1]
+
+
+def read_ulog(path: Path) -> tuple[ULog, dict[str, dict[str, npt.NDArray[Any]]]]:
+    """As pyulog has it, and as `read`. Raises `LogError`."""
     from pyulog.core import ULog, ULogException
 
     try:
@@ -296,11 +359,12 @@ def read(path: Path) -> dict[str, dict[str, npt.NDArray[Any]]]:
             log = ULog(file, disable_str_exceptions=False)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ULogException, UnicodeDecodeError) as error:
+    except (ULogException, UnicodeDecodeError, struct.error) as error:
         raise LogError(f"{path}: not a ULog file: {error}") from error
     if log.file_corruption:
-        raise LogError(f"{path}: damaged: a message in it is not valid ULog")
-    return {Topic(dataset.name, (), dataset.multi_id).key: _columns(dataset.data) for dataset in log.data_list}
+        why = "damaged" if log.data_list else "damaged, or cut before the first row"
+        raise LogError(f"{path}: {why}: a message in it is not valid ULog")
+    return log, {Topic(data.name, (), data.multi_id).key: _columns(data.data) for data in log.data_list}
 
 
 def _columns(flat: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
@@ -318,6 +382,39 @@ def _columns(flat: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
 
 def _message(kind: str, body: bytes) -> bytes:
     return struct.pack("<HB", len(body), ord(kind)) + body
+
+
+def information(flight: Flight, boot_us: int | None = None) -> dict[str, str | int]:
+    """What a log says of itself, by PX4's keys and `scenario` and `seed`.
+
+    `boot_us`: UNIX time at its zero; None in lock-step, where a flight is the same at any time.
+    """
+    major, minor, patch = (int(part) for part in re.findall(r"\d+", __version__)[:3])
+    found: dict[str, str | int] = {
+        "sys_name": "mavsitl",
+        "ver_hw": "SITL",
+        "ver_sw": __version__,
+        "ver_sw_release": major << 24 | minor << 16 | patch << 8 | _RELEASE,
+        "ver_data_format": _DATA_FORMAT,
+        "time_ref_utc": 0,
+        "scenario": flight.name,
+        "seed": str(flight.scenario.seed),
+    }
+    return found if boot_us is None else found | {"boot_time_utc_us": boot_us}
+
+
+def _information(key: str, value: str | int) -> bytes:
+    if isinstance(value, int):
+        kind, code = NUMBERS[key]
+        return _keyed(f"{kind} {key}", struct.pack(code, value))
+    text = value.encode("utf-8")
+    return _keyed(f"char[{len(text)}] {key}", text)
+
+
+def _parameter(name: str, value: float) -> bytes:
+    if isinstance(value, int):
+        return _keyed(f"int32_t {name}", struct.pack("<i", value))
+    return _keyed(f"float {name}", struct.pack("<f", value))
 
 
 def _keyed(declaration: str, value: bytes) -> bytes:

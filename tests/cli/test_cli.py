@@ -30,6 +30,7 @@ COMMANDS = (
     "tune",
     "bench",
     "report",
+    "log",
     "scenarios",
     "chaos",
     "completion",
@@ -63,6 +64,7 @@ HELP = {
     "scenarios": ("--json",),
     "completion": ("bash", "zsh", "fish", 'eval "$(mavsitl completion bash)"'),
     "chaos": ("--json", "NAME[:ARGUMENT...][@PORT]", "ack-late:2.5:NAV_TAKEOFF@gcs"),
+    "log": ("info", "convert", "diff", "mavsitl log convert hover hover.ulg"),
 }  # fmt: skip
 
 

@@ -46,6 +46,7 @@ def test_a_tlog_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> None:
 def test_a_ulog_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> None:
     path, cut = tmp_path / "a.ulg", tmp_path / "cut.ulg"
     with UlogWriter(path, {"sys_name": "x"}, {"P": 1.0}, topics=(ATTITUDE,)) as ulog:
+        ulog.flush()
         begin = path.stat().st_size
         for k in range(5):
             ulog.topic(ATTITUDE).append(1000 * k, 1, 0, 0, 0)
@@ -109,6 +110,7 @@ def test_a_full_disk_ends_the_log_and_not_the_flight(tmp_path: Path, monkeypatch
 def test_without_somebody_to_tell_it_is_an_error(tmp_path: Path) -> None:
     with ends._logs(tmp_path, "ground", FLIGHT) as (recorder, tap):
         writer: Any = recorder
+        recorder.message(0, 6, "the first, with which the definitions end")
         writer._sink._file = Full(writer._sink._file, 10)
         recorder.message(0, 6, "too long for it")
         with pytest.raises(LogError, match="No space left"):
@@ -162,6 +164,7 @@ def test_a_run_in_lock_step_writes_over_the_last(tmp_path: Path) -> None:
 def test_the_tap_is_told_to_flush(tmp_path: Path) -> None:
     with ends._logs(tmp_path, "vehicle", FLIGHT) as (recorder, tap):
         assert isinstance(tap, Tap)
+        recorder.topic(ATTITUDE)  # ends the definitions, which go to the disk at once
         before = (tmp_path / "vehicle.ulg").stat().st_size
         recorder.message(0, 6, "hello")
         tap.tick(0, 499_999)

@@ -70,7 +70,9 @@ def write(made: Made, vehicle: Recorder, ground: Recorder, seed: int = 1) -> Non
         speeds = 182.5 + rng.standard_normal(4)
         vehicle.topic(topics.ROTOR_STATUS).append(now, *speeds, int(step % 10 == 0))
         ground.topic(topics.TRAJECTORY_SETPOINT).append(now, reference[0], -reference[1], -reference[2], 0, 0, 0, 0)
-        ground.topic(topics.ATTITUDE_SETPOINT).append(now, radians(phi_d), -radians(theta_d), 0.0, 0.0, 0.0, -0.5)
+        ground.topic(topics.ATTITUDE_SETPOINT).append(
+            now, radians(phi_d), -radians(theta_d), 0.0, 0.0, 0.0, -0.5, *quaternion_ned(phi_d, theta_d, 0.0), 0.0
+        )
         ground.topic(topics.CONTROL_DEMAND).append(now, 7.09 + 0.1 * rng.standard_normal(), 0.1 * sin(t), 0, 0, 0, 0, 0)
         ground.topic(topics.LINK_STATUS).append(now, step, step // 1000, 0, 4000)
         if made.learning:

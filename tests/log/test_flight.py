@@ -58,7 +58,7 @@ def test_angles_come_out_as_they_went_in() -> None:
         vehicle.topic(topics.LOCAL_POSITION_TRUTH).append(stamp, 0, 0, 0, 0, 0, 0)
         vehicle.topic(topics.ATTITUDE_TRUTH).append(stamp, *quaternion_ned(*each))
         ground.topic(topics.TRAJECTORY_SETPOINT).append(stamp, *[0] * 7)
-        ground.topic(topics.ATTITUDE_SETPOINT).append(stamp, 0, 0, np.radians(179.0), 0, 0, 0)
+        ground.topic(topics.ATTITUDE_SETPOINT).append(stamp, 0, 0, np.radians(179.0), *[0] * 8)
     flight = FlightData.from_recorders(vehicle, ground)
     np.testing.assert_allclose(flight.attitude_deg[-4:], angles, atol=1e-4)
     np.testing.assert_allclose(flight.attitude_reference_deg[-4:, 2], -179.0, atol=1e-4)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pyulog.core import ULog
 
-from mavsitl.log.topics import ATTITUDE, LINK_STATUS, LOCAL_POSITION, PIDNN_WEIGHTS, ROTOR_STATUS, TOPICS, Topic
+from mavsitl.log.topics import ATTITUDE, LINK_STATUS, LOCAL_POSITION_TRUTH, PIDNN_WEIGHTS, ROTOR_STATUS, TOPICS, Topic
 from mavsitl.log.ulog import LogError, MemoryRecorder, Recorder, UlogWriter, read
 
 FIRST = Topic("first", ("float x", "uint16_t[2] pair", "int32_t signed", "double wide", "uint8_t flag"))
@@ -18,7 +18,7 @@ FIRST = Topic("first", ("float x", "uint16_t[2] pair", "int32_t signed", "double
 
 def fill(recorder: Recorder, rows: int) -> None:
     for k in range(rows):
-        recorder.topic(LOCAL_POSITION).append(4000 * k, 0.1 * k, -k, 1e-30, math.nan, 2.0, 3.0)
+        recorder.topic(LOCAL_POSITION_TRUTH).append(4000 * k, 0.1 * k, -k, 1e-30, math.nan, 2.0, 3.0)
         recorder.topic(ATTITUDE).append(4000 * k, 1.0, 0.25, -0.5, k)
         if k % 10 == 0:
             recorder.topic(LINK_STATUS).append(4000 * k, k, 2**32 - 1, 0, 8000)
@@ -43,7 +43,7 @@ def test_a_wrong_field_is_refused(field: str) -> None:
 def test_memory_gives_back_what_was_appended_beyond_its_first_buffer() -> None:
     memory = MemoryRecorder()
     fill(memory, 10_000)
-    columns = memory.arrays(LOCAL_POSITION)
+    columns = memory.arrays(LOCAL_POSITION_TRUTH)
     assert columns["timestamp"].dtype == np.uint64
     np.testing.assert_array_equal(columns["timestamp"], 4000 * np.arange(10_000))
     np.testing.assert_array_equal(columns["x"], (0.1 * np.arange(10_000)).astype(np.float32))
@@ -103,19 +103,20 @@ def test_pyulog_reads_the_same_numbers_texts_and_definitions(tmp_path: Path) -> 
 def test_a_cut_file_is_read_up_to_the_cut(tmp_path: Path) -> None:
     whole = tmp_path / "whole.ulg"
     with UlogWriter(whole, {}, {}) as ulog:
+        ulog.flush()
         definitions = whole.stat().st_size
         fill(ulog, 50)
     data = whole.read_bytes()
     full = read(whole)
     cut = tmp_path / "cut.ulg"
-    for length in (definitions, definitions + 1, definitions + 40, definitions + 177, len(data) // 2, len(data) - 1):
+    for length in (definitions, definitions + 1, definitions + 40, definitions + 177, len(data) - 900, len(data) - 1):
         cut.write_bytes(data[:length])
         tables = read(cut)
         for name, columns in tables.items():
             for column, values in columns.items():
                 np.testing.assert_array_equal(values, full[name][column][: len(values)])
     assert len(tables["vehicle_attitude"]["timestamp"]) == 49
-    assert len(tables["vehicle_local_position"]["timestamp"]) == 50
+    assert len(tables["vehicle_local_position_groundtruth"]["timestamp"]) == 50
 
 
 def test_rows_are_on_disk_after_a_flush(tmp_path: Path) -> None:
@@ -165,6 +166,7 @@ def test_a_full_disk_is_reported() -> None:
 def test_a_damaged_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "a.ulg"
     with UlogWriter(path, {}, {}) as ulog:
+        ulog.flush()
         definitions = path.stat().st_size
         fill(ulog, 50)
     data = bytearray(path.read_bytes())

@@ -11,6 +11,7 @@ import numpy as np
 
 from mavsitl import seeds
 from mavsitl.frames import Vector
+from mavsitl.log.block import BLOCK_ROWS
 from mavsitl.quaternion import conjugate, rotate, to_euler
 from mavsitl.scenario import DrydenMil, Flight, Gust, Steady, Wind
 from mavsitl_vehicle import tick
@@ -104,7 +105,7 @@ class Simulation:
         self._asked_bytes = self._asked.data.cast("B")
         self.demand = self._asked.T
         self.demand[tick.ATTITUDE] = 1.0
-        self._log = np.zeros((BLOCK_TICKS, tick.LOG_WIDTH, n))
+        self._log = np.zeros((BLOCK_ROWS, tick.LOG_WIDTH, n))
         """The row of what is now is number `_tick`, modulo its length."""
         self._block = scratch(n)
         self.held = np.full(n, scenario.start.clamp)
@@ -308,7 +309,7 @@ class Simulation:
 
     def logged(self, j: int, count: int) -> tick.Array:
         """(count, tick.LOG_WIDTH) of vehicle `j`: now, and the ticks before it, the oldest first."""
-        return self._log[np.arange(self._tick - count + 1, self._tick + 1) % BLOCK_TICKS, :, j]
+        return self._log[np.arange(self._tick - count + 1, self._tick + 1) % BLOCK_ROWS, :, j]
 
     def _advance_sensed(self, sensed: SensedEstimator, number: int) -> None:
         field, unit = self.field, sensed.imu
@@ -323,7 +324,7 @@ class Simulation:
     def _present(self) -> None:
         """The estimate as lists, and the log's row of what is now."""
         self.estimates = self.estimate.T.tolist()
-        tick.write_log(self._rows, self._asked, self._log[self._tick % BLOCK_TICKS])
+        tick.write_log(self._rows, self._asked, self._log[self._tick % BLOCK_ROWS])
 
     def _make_sensed(self, seed: int, failures: Failures, vehicles: Sequence[int]) -> SensedEstimator:
         return SensedEstimator(self._flight, self._parameters[0], failures, seed, self.x, self.dt_s, vehicles)

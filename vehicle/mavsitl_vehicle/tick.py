@@ -57,7 +57,8 @@ RATE_INTEGRAL = 0  # 0:3, torque share
 LAST_GYRO = 3  # 3:6, rad/s
 RATE_SETPOINT = 6  # 6:9, rad/s
 SATURATED = 9  # allocation's saturation bits, OR-ed over the tick
-INNER_ROWS = 10
+TORQUE_SETPOINT = 10  # 10:13, what allocation is asked for, shares of the largest torque
+INNER_ROWS = 13
 
 # Rows of `motors` (MOTOR_ROWS, n), what becomes of the commands to rotors 1..4.
 SPEED_SHARE = 0  # 0:4, of the commanded speed
@@ -87,8 +88,14 @@ LOG_ESTIMATE = 17  # 17:30
 LOG_WIND = 30  # 30:33
 LOG_RATE_SETPOINT = 33  # 33:36
 LOG_SATURATED = 36
-LOG_THRUST = 37
-LOG_WIDTH = 38
+LOG_TORQUE = 37  # 37:40
+LOG_RATE_INTEGRAL = 40  # 40:43
+LOG_COMMANDED = 43  # 43:47
+LOG_KIND = 47
+LOG_ATTITUDE = 48  # 48:52, as demanded
+LOG_THRUST = 52
+LOG_YAW_RATE = 53
+LOG_WIDTH = 54
 
 
 @compiled
@@ -140,6 +147,7 @@ def inner_loops(
             for i in range(3):
                 inner[RATE_INTEGRAL + i, j] = 0.0
                 inner[LAST_GYRO + i, j] = gyro[i, j]
+                inner[TORQUE_SETPOINT + i, j] = demand[TORQUE + i, j]
             torque = (
                 demand[TORQUE, j] * gains[MAX_TORQUE, j],
                 demand[TORQUE + 1, j] * gains[MAX_TORQUE + 1, j],
@@ -158,6 +166,7 @@ def inner_loops(
                     integral = inner[RATE_INTEGRAL + i, j] + gains[RATE_I + i, j] * error * dt_s
                     inner[RATE_INTEGRAL + i, j] = min(max(integral, -limit), limit)
                 inner[LAST_GYRO + i, j] = rate
+                inner[TORQUE_SETPOINT + i, j] = value
                 if i == 0:
                     share = (value, share[1], share[2])
                 elif i == 1:
@@ -233,11 +242,18 @@ def write_log(rows: Array, asked: Array, row: Array) -> None:
     for i in range(LOG_RATE_SETPOINT):  # truth, estimate and wind stand one after the other in both
         for j in range(row.shape[1]):
             row[i, j] = rows[i, j]
-    for i in range(RATE_SETPOINT, INNER_ROWS):
+    for i in range(RATE_SETPOINT, INNER_ROWS):  # rate setpoint, saturation and torque likewise
         for j in range(row.shape[1]):
             row[LOG_RATE_SETPOINT + i - RATE_SETPOINT, j] = rows[INNER_AT + i, j]
     for j in range(row.shape[1]):
+        for i in range(3):
+            row[LOG_RATE_INTEGRAL + i, j] = rows[INNER_AT + RATE_INTEGRAL + i, j]
+        for i in range(4):
+            row[LOG_COMMANDED + i, j] = rows[MOTORS_AT + COMMANDED + i, j]
+            row[LOG_ATTITUDE + i, j] = asked[j, ATTITUDE + i]
+        row[LOG_KIND, j] = asked[j, KIND]
         row[LOG_THRUST, j] = asked[j, THRUST]
+        row[LOG_YAW_RATE, j] = asked[j, YAW_RATE]
 
 
 @compiled

@@ -119,15 +119,16 @@ class Vehicle:
         self._signing = self.kept.signing
         failures = Timeline(flight, self.failures, lockstep=lockstep)
         self.kept.say = lambda severity, text: self.autopilot.say(severity, text)
+        self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
+        recorder.begin(self.parameters.as_dict(), self.parameters.defaults)
+        self._record = Record(recorder, flight, self.simulation, self.column, aboard=self._seated is not None)
         self.autopilot = self._boot(0)
         self.links = LinkControl(self.parameters, self.failures, flight.scenario, lockstep=lockstep)
         self.parameters.subscribe(self._on_parameter)
         self._mishaps = Mishaps(self)
         changes = ParameterTimeline(flight, self.parameters, self.warn)
         self._timelines: list[Timeline | ParameterTimeline] = [line for line in (failures, changes) if line]
-        self._seated = SeatedLaw(flight) if flight.scenario.controller.inner == "pidnn" else None
         self._wind = None if lockstep else WindEstimate(flight.airframe, self.period_us / 1e6)
-        self._record = Record(recorder, flight, self.simulation, self.column, aboard=self._seated is not None)
         self._now_us = -self.period_us
         self._held: bool | None = None
         self._at_rest: bool | None = None
@@ -184,7 +185,7 @@ class Vehicle:
         autopilot = Autopilot(
             self._flight, self.system_id, self._port_names, self.parameters, _Body(simulation, j), kept.shared,
             lockstep=self._lockstep, unix_boot_us=unix_us, failures=self.failures,
-            forwards=self._forwards, stream_hz=self._stream_hz,
+            forwards=self._forwards, stream_hz=self._stream_hz, journal=self._record,
         )  # fmt: skip
         autopilot.estimate = simulation.estimates[j]
         autopilot.estimator_status = simulation.estimator_status
@@ -233,6 +234,11 @@ class Vehicle:
         """What a failure names is well again. Raises ValueError."""
         unit, _ = understood(failure, self._flight.scenario, lockstep=self._lockstep)
         self.failures.set(unit, Kind.OK, failure.instance)
+
+    @property
+    def clock_us(self) -> int:
+        """The autopilot's clock at the last step: since it booted."""
+        return self._clock_us
 
     @property
     def weights(self) -> Array | None:
@@ -351,12 +357,11 @@ class Vehicle:
         """A failure was injected or cleared, whoever asked for it: say so on every link and in the log."""
         severity = mavlink.MAV_SEVERITY_NOTICE if change.kind is Kind.OK else mavlink.MAV_SEVERITY_WARNING
         self.autopilot.queue_text(severity, change.text)
-        self._record.failed(max(self._now_us, 0), severity, change)
+        self._record.failed(max(self._now_us, 0), change)
 
     def note(self, text: str) -> None:
         """Something happened to the vehicle: say so on every link and in the log."""
         self.autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, text)
-        self._record.note(max(self._now_us, 0), mavlink.MAV_SEVERITY_WARNING, text)
 
     def close(self) -> None:
         """Close the files that clients had open. What is `unsaved` afterwards is the last there is to write."""
@@ -391,6 +396,7 @@ class Vehicle:
             before.close()
 
     def _on_parameter(self, name: str, value: float) -> None:
+        self._record.parameter(name, value)
         self.simulation.set_parameter(self.column, name)
         if name == "MAV_SIGN_CFG" and self._signing is not None:
             self._signing.policy.mode = SigningMode(int(value))

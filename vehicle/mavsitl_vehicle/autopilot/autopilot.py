@@ -13,6 +13,7 @@ from mavsitl.geodesy import Origin
 from mavsitl.quaternion import to_euler
 from mavsitl.routing import Router
 from mavsitl.scenario import Flight
+from mavsitl.services.command import Command
 from mavsitl.services.statustext import TextLimiter, chunks
 from mavsitl_vehicle.autopilot import modes, setpoints, telemetry
 from mavsitl_vehicle.autopilot.battery import Battery, Level
@@ -99,6 +100,19 @@ class Body(Protocol):
     def readings(self) -> Readings | None: ...
 
 
+class Journal(Protocol):
+    """Hears what happens, for the log."""
+
+    def text(self, severity: int, text: str) -> None:
+        """A STATUSTEXT."""
+
+    def command(self, command: Command, result: int) -> None:
+        """It was executed, with that MAV_RESULT."""
+
+    def valid(self, valid: Validity) -> None:
+        """The estimate, or no longer, from now on."""
+
+
 class Autopilot:
     """Sans-IO. `receive` datagrams, `decide` once a tick before the physics, `observe` and `report` after it."""
 
@@ -116,6 +130,7 @@ class Autopilot:
         failures: Failures | None = None,
         forwards: bool = True,
         stream_hz: float | None = None,
+        journal: Journal | None = None,
     ) -> None:
         """`failures`: what is broken of the battery, the sticks, the links and, by what it is told, the motors.
 
@@ -123,6 +138,7 @@ class Autopilot:
         """
         scenario, airframe = flight.scenario, flight.airframe
         self.system_id = system_id
+        self.journal = journal
         self.unix_boot_us = self._true_unix_boot_us = unix_boot_us
         self.load = 0.0
         self.failures = Failures() if failures is None else failures
@@ -335,6 +351,8 @@ class Autopilot:
             self._status = status
             self.accuracy = telemetry.accuracy(status)
             self.valid = self._validity(status)
+            if self.journal is not None:
+                self.journal.valid(self.valid)
 
     def _validity(self, status: EstimatorStatus) -> Validity:
         """As the estimator says, within COM_VEL_FS_EVH and COM_POS_FS_EPH."""
@@ -450,6 +468,8 @@ class Autopilot:
             return
         self._text_id = self._text_id % 65535 + 1
         self._texts += chunks(severity, text, self._text_id)
+        if self.journal is not None:
+            self.journal.text(severity, text)
 
     def say(self, severity: int, text: str) -> None:
         """A text that a request may cause again and again: what is before its first colon speaks at a bounded rate."""

@@ -258,6 +258,11 @@ class Commander:
         """A fail-safe, not the user, has set the mode, be it the one that the user had chosen."""
         return self._acting
 
+    @property
+    def overruled(self) -> bool:
+        """A fail-safe's cause is there, and the user has chosen a mode since."""
+        return bool(self._overridden)
+
     def step(self, now_us: int, situation: Situation) -> None:
         self.situation = situation
         self.now_us = now_us

@@ -657,6 +657,11 @@ class Parameters:
         """All values: int for INT32, float for REAL32."""
         return dict(self._values)
 
+    @property
+    def defaults(self) -> Mapping[str, float]:
+        """Those of this airframe and scenario."""
+        return MappingProxyType(self._defaults)
+
     def changed(self) -> dict[str, float]:
         """What differs from the defaults of this airframe and scenario, volatile ones left out: what a file keeps."""
         return {

@@ -188,4 +188,7 @@ class Port:
         self._logs.close()
 
     def _execute(self, command: Command, now_us: int) -> int:
-        return commands.execute(self._autopilot, command, now_us, self)
+        result = commands.execute(self._autopilot, command, now_us, self)
+        if self._autopilot.journal is not None:
+            self._autopilot.journal.command(command, result)
+        return result

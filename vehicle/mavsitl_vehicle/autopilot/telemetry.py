@@ -553,24 +553,27 @@ def send_global_position_int(subject: Subject, node: Node, now_us: int) -> bool:
 
 
 _GPS_RAW_INT = _pack("gps_raw_int")
-_HDOP_CENTI, _VDOP_CENTI = 70, 110
+HDOP, VDOP = 0.7, 1.1
+_HDOP_CENTI, _VDOP_CENTI = round(100 * HDOP), round(100 * VDOP)
 _SATELLITES = 10
 _NO_YAW = 0
+
+
+def gps_of_estimate(subject: Subject) -> GpsReading | None:
+    """What a receiver says that is as good as the estimate, without sensors; None: it has no fix."""
+    if not subject.health.gps:
+        return None
+    e, quality = subject.estimate, subject.accuracy
+    return GpsReading(
+        (e[0], e[1], e[2]), (e[3], e[4], e[5]), _SATELLITES,
+        quality.position_m, quality.position_m, quality.velocity_m_s, 0,
+    )  # fmt: skip
 
 
 def send_gps_raw_int(subject: Subject, node: Node, now_us: int) -> bool:
     """As the receiver tells it; without sensors it is as good as the estimate. With a fault it has no fix."""
     readings = subject.readings
-    if readings is not None:
-        fix = readings.gps
-    elif subject.health.gps:
-        e, quality = subject.estimate, subject.accuracy
-        fix = GpsReading(
-            (e[0], e[1], e[2]), (e[3], e[4], e[5]), _SATELLITES,
-            quality.position_m, quality.position_m, quality.velocity_m_s, 0,
-        )  # fmt: skip
-    else:
-        fix = None
+    fix = gps_of_estimate(subject) if readings is None else readings.gps
     if fix is None:
         node.send(
             _GPS_RAW_INT, now_us, mavlink.GPS_FIX_TYPE_NO_FIX, 0, 0, 0, UINT16_MAX, UINT16_MAX, UINT16_MAX, UINT16_MAX,
