@@ -39,7 +39,7 @@ class SourceStatistics:
     restarts: int = 0
     """times the sender began to count anew"""
     heard: int = 0
-    """the node's count of frames when this source was last heard"""
+    """the node's count of good frames when this source was last heard"""
     late_run: int = 0
 
     @property
@@ -52,7 +52,8 @@ class SourceStatistics:
         self.received += 1
         step = (sequence - self.sequence) & 0xFF
         if 0 < step < _LATE:
-            self.lost += step - 1
+            if step > 1:
+                self.lost += step - 1
             self.sequence = sequence
             self.late_run = 0
             return
@@ -106,7 +107,7 @@ class Node:
         self.tamper: Tamper | None = None
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
         self._sequence = 0
-        self._frames_heard = 0
+        self._addresses = {(system, component) for system in (0, system_id) for component in (0, component_id)}
         self._outbox: list[bytes] = []
 
     def continue_from(self, sequence: int) -> None:
@@ -179,21 +180,20 @@ class Node:
         frames = parse(datagram, self.counters)
         if self.signing is not None:
             frames = self.signing.incoming(frames, (self.system_id, self.component_id))
-        own, sources = self.address, self.sources
-        echoed = False
+        sources, heard, echoed = self.sources, self.counters.frames, False
         for frame in frames:
             sender = (frame.system_id, frame.component_id)
-            if sender == own:
-                echoed = True
-                continue
             source = sources.get(sender)
-            if source is None:
+            if source is not None:
+                source.update(frame.sequence)
+            elif sender != self.address:
                 source = self._meet(sender, frame.sequence)
             else:
-                source.update(frame.sequence)
-            self._frames_heard = source.heard = self._frames_heard + 1
+                echoed = True
+                continue
+            source.heard = heard
         if echoed:
-            others = [frame for frame in frames if (frame.system_id, frame.component_id) != own]
+            others = [frame for frame in frames if (frame.system_id, frame.component_id) != self.address]
             self.own_frames += len(frames) - len(others)
             return others
         return frames
@@ -208,8 +208,7 @@ class Node:
 
         A message without target fields is meant for everybody.
         """
-        target_system, target_component = frame.target
-        return target_system in (0, self.system_id) and target_component in (0, self.component_id)
+        return frame.target in self._addresses
 
     def _meet(self, sender: tuple[int, int], sequence: int) -> SourceStatistics:
         """A sender not heard before, or forgotten."""

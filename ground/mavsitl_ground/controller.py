@@ -297,11 +297,11 @@ class Ground:
         state = self._observer
         if now_us >= self._due_us or state.restarted:
             self._attend(now_us)
-        if state.fresh and state.valid(now_us):
-            state.take()
+        age_us = state.take(now_us)
+        if age_us is not None:
             if self._scenario.ground_contact:
                 self._watch_crash(now_us)
-            self._control(now_us)
+            self._control(now_us, age_us)
         if now_us - self._heartbeat_us >= HEARTBEAT_INTERVAL_US and not self.finished:
             self._heartbeat_us = now_us
             self._node.send(
@@ -335,7 +335,8 @@ class Ground:
     def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
         return self._node.datagrams(combine=combine)
 
-    def _control(self, now_us: int) -> None:
+    def _control(self, now_us: int, age_us: int) -> None:
+        """On a new state, `age_us` old."""
         handshake, state = self._handshake, self._observer
         target = handshake.target
         if target is None or self.finished:
@@ -349,7 +350,7 @@ class Ground:
         counters, source = self._node.counters, self._node.sources.get(target)
         demand = self._controller.update(
             time_s, state, self._rows.row(stamp_us),
-            counters.frames, 0 if source is None else source.lost, counters.rejected, state.age_us(now_us) or 0,
+            counters.frames, 0 if source is None else source.lost, counters.rejected, age_us,
         )  # fmt: skip
         self._send_demand(self._node, target, stamp_us, demand)
         if time_s >= self._scenario.duration_s and handshake.phase is Phase.FLY:

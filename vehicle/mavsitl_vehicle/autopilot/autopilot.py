@@ -66,7 +66,7 @@ SLOW_BATTERY_US = 20_000_000
 _ALL_VALID = Validity()
 
 _read_attitude_target = reader(
-    mavlink.MAVLink_set_attitude_target_message, "time_boot_ms", *setpoints.ATTITUDE_TARGET_FIELDS
+    mavlink.MAVLink_set_attitude_target_message, "time_boot_ms", *setpoints.ATTITUDE_TARGET_FIELDS, flat=True
 )
 
 
@@ -190,6 +190,8 @@ class Autopilot:
         self._altitude_loss = AltitudeLoss()
         self.shown: Shown | None = None
         """What `report` said last: the same object until that changes."""
+        self._reported: tuple[object, ...] = ()
+        """What it was made of."""
         self._gcs_us: int | None = None
         self._links_failed = False
         self._look_us = 0
@@ -262,9 +264,9 @@ class Autopilot:
             self.queue_text(mavlink.MAV_SEVERITY_ERROR, text)
 
     def _on_attitude_target(self, frame: Frame, now_us: int) -> None:
-        fields = _read_attitude_target(frame)
-        self.token_us = fields[0] * 1000
-        self._take(setpoints.from_attitude_target(*fields[1:]), now_us)
+        time_ms, *asked = _read_attitude_target(frame)
+        self.token_us = time_ms * 1000
+        self._take(setpoints.from_attitude_target(*asked), now_us)
 
     def _on_actuator_control_target(self, frame: Frame, now_us: int) -> None:
         message = frame.message
@@ -349,11 +351,6 @@ class Autopilot:
             status.velocity_valid and status.evh_m_s <= velocity_m_s,
             status.position_valid and (position_m < 0.0 or status.eph_m <= position_m),
         )
-
-    @property
-    def at_rest(self) -> bool:
-        """It does not move, and knows it: in the clamp, or disarmed on the ground."""
-        return self.land.held or (self.land.on_ground and not self.commander.armed)
 
     # --- what commands need ------------------------------------------------------------------------------------------
 
@@ -809,9 +806,9 @@ class Autopilot:
             now_us,
             self.estimate,
             0.0 if setpoint is None else setpoint.thrust,
-            armed=commander.armed,
-            ready=land.on_ground and commander.spooled_up(now_us),
-            landing=self.navigator.landing,
+            commander.armed,
+            land.on_ground and commander.spooled_up(now_us),
+            self.navigator.landing,
         )
         if took_off:
             self.flight_times = self.flight_times._replace(took_off_us=max(now_us, 1))
@@ -849,15 +846,17 @@ class Autopilot:
 
     def _changed(self) -> bool:
         """Whether what is told at once is another than in the last report."""
-        before, commander = self.shown, self.commander
-        mode, armed, failsafe, landed_state = commander.mode, commander.armed, commander.failsafe, self.landed_state
-        if before is None:
-            self.shown = Shown(mode, armed, failsafe, landed_state)
+        commander = self.commander
+        mode, armed, failsafe = commander.mode, commander.armed, commander.failsafe
+        state = mode, armed, failsafe, self.land.state, self.navigator.landing
+        if state == self._reported:
             return False
-        if before == (mode, armed, failsafe, landed_state):
+        self._reported = state
+        before, shown = self.shown, Shown(mode, armed, failsafe, self.landed_state)
+        if shown == before:
             return False
-        self.shown = Shown(mode, armed, failsafe, landed_state)
-        return True
+        self.shown = shown
+        return before is not None
 
     def _fail_links(self) -> None:
         """What counts on each link until the next period: an answer to the command that breaks it still goes."""

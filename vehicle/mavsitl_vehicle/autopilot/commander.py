@@ -247,16 +247,12 @@ class Commander:
         self._since_us: dict[str, int] = {}
         """Name of a row with `after` to the time when its cause began."""
         self._overridden: set[str] = set()
-        self._acting = False
+        self.failsafe = False
+        """A fail-safe, not the user, has set the mode, be it the one that the user had chosen."""
         self._worst = Action.NONE
         self._delay = HoldDelay()
         self._delaying = False
         self._watched_us = 0
-
-    @property
-    def failsafe(self) -> bool:
-        """A fail-safe, not the user, has set the mode, be it the one that the user had chosen."""
-        return self._acting
 
     def step(self, now_us: int, situation: Situation) -> None:
         self.situation = situation
@@ -303,7 +299,7 @@ class Commander:
         allowed = bit & int(self.parameters["COM_RC_OVERRIDE"])
         if not allowed or not self.armed or self.situation.landed or self.kill_engaged:
             return False
-        if self._acting and self.mode is Mode.LOITER and (self._delaying or not self._sticks_end_hold()):
+        if self.failsafe and self.mode is Mode.LOITER and (self._delaying or not self._sticks_end_hold()):
             return False
         for mode in (Mode.POSCTL, Mode.ALTCTL, Mode.STABILIZED):
             if self.cannot_fly(mode) is None:
@@ -470,17 +466,17 @@ class Commander:
         self._worst = worst
         if worst is _NONE:
             self.mode = self.intended
-            self._acting = False
+            self.failsafe = False
         elif worst is _A.DISARM:
             self._disarm("failsafe")
         elif worst in ACTION_MODES:
             self.mode = ACTION_MODES[worst]
-            self._acting = True
+            self.failsafe = True
             if self.intended is Mode.ORBIT:
                 self.intended = Mode.LOITER  # as on PX4: a circle is not taken up again
         else:
             self.mode = self.intended
-            self._acting = False
+            self.failsafe = False
 
     def _lasts(self, row: Failsafe, now_us: int) -> bool:
         """The cause has been there for as long as it must."""
@@ -521,7 +517,7 @@ class Commander:
         if known is None:
             return _A.NONE
         held_only = row.deferred and known is _A.HOLD
-        if known in ACTION_MODES and self._acting and not row.ends_with_cause and not held_only:
+        if known in ACTION_MODES and self.failsafe and not row.ends_with_cause and not held_only:
             action = self._possible(known)
             self._note(row, action)
             return action
@@ -563,7 +559,7 @@ class Commander:
 
     def _choose(self, mode: Mode) -> None:
         self.intended = self.mode = mode
-        self._acting = self._delaying = False
+        self.failsafe = self._delaying = False
         self._worst = _A.NONE
         self._tripped = {name: known for name, known in self._tripped.items() if name not in self._overridden}
 
