@@ -608,7 +608,7 @@ def _build_target(message_class: MessageClass) -> Callable[[Frame], tuple[int, i
     """What reads target system and component of a frame; the one that a message has not is 0, everybody."""
     names = [name for name in ("target_system", "target_component") if name in message_class.fieldnames]
     if len(names) == 2:
-        return reader(message_class, *names)  # type: ignore[return-value]
+        return reader(message_class, *names)
     if not names:
         return lambda frame: (0, 0)
     read = reader(message_class, *names)

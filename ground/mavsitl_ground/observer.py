@@ -236,12 +236,12 @@ class Observer:
             handler(frame)
 
     def _on_odometry(self, frame: Frame) -> None:
-        stamp_us, *motion, frame_id, child = read_odometry(frame)
+        stamp_us, x, y, z, q_w, q_x, q_y, q_z, vx, vy, vz, p, q_rate, r, frame_id, child = read_odometry(frame)
         if frame_id != mavlink.MAV_FRAME_LOCAL_NED or child not in FRAMES:
             return
         newer = stamp_us >= self.stamp_us and stamp_us >= self._position_us
         in_body = child == mavlink.MAV_FRAME_BODY_FRD
-        if not take_odometry(*motion, in_body, newer, self.state):
+        if not take_odometry(x, y, z, q_w, q_x, q_y, q_z, vx, vy, vz, p, q_rate, r, in_body, newer, self.state):
             return
         if newer:
             self._attitude_at(stamp_us)

@@ -5,44 +5,30 @@ from __future__ import annotations
 import numpy as np
 
 from mavsitl.control.arrays import Floats
-from mavsitl.frames import flip_euler
 from mavsitl.log import topics
-from mavsitl.log.block import Block, ned
+from mavsitl.log.block import Block, columns
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
 from mavsitl_ground import cycle
-
-_DESIRED = slice(cycle.DESIRED, cycle.DESIRED + 3)
-_BY_NET = [cycle.WEIGHTS + k for k in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
-"""From (P, I, D) x (roll, pitch, yaw) to a net after another."""
 
 
 def block(recorder: Recorder, flight: Flight, *, with_weights: bool) -> Block:
     """Takes the rows that `mavsitl_ground.cycle` fills and makes the topics' of them."""
     airframe = flight.airframe
-    # Angular acceleration to U_2, U_3 (forces) and U_4 (torque).
+    # Angular acceleration to U_2, U_3 (forces) and U_4 (torque), beside U_1 and W_1..W_3.
     per_u = np.array(airframe.inertia_kg_m2) / (airframe.arm_m, airframe.arm_m, 1.0)
+    scale = np.concatenate(([1.0], per_u, [1.0, 1.0, 1.0]))
 
-    def trajectory(v: Floats) -> Floats:
-        position, velocity = v[:, cycle.POSITION :][:, :3], v[:, cycle.VELOCITY :][:, :3]
-        return np.hstack((ned(position), ned(velocity), -v[:, cycle.YAW, np.newaxis]))
+    def control_demand(rows: Floats) -> Floats:
+        demand: Floats = rows[:, cycle.U1 : cycle.LINK] * scale
+        return demand
 
-    def control_demand(v: Floats) -> Floats:
-        acceleration, wind = v[:, cycle.ACCELERATION :][:, :3], v[:, cycle.WIND :][:, :3]
-        return np.hstack((v[:, cycle.U1, np.newaxis], acceleration * per_u, wind))
-
-    columns = [
-        (topics.TRAJECTORY_SETPOINT, trajectory),
-        (topics.ATTITUDE_SETPOINT, _attitude_setpoint),
+    found = [
+        (topics.TRAJECTORY_SETPOINT, columns(cycle.POSITION, cycle.DESIRED)),
+        (topics.ATTITUDE_SETPOINT, columns(cycle.DESIRED, cycle.U1)),
         (topics.CONTROL_DEMAND, control_demand),
-        (topics.LINK_STATUS, lambda v: v[:, cycle.LINK : cycle.LINK + 4]),
+        (topics.LINK_STATUS, columns(cycle.LINK, cycle.WEIGHTS)),
     ]
     if with_weights:
-        columns.append((topics.PIDNN_WEIGHTS, lambda v: v[:, _BY_NET]))
-    return Block(recorder, cycle.COLUMNS, columns)
-
-
-def _attitude_setpoint(v: Floats) -> Floats:
-    """phi_d, theta_d, psi_d in FRD and PX4's thrust_body, (k, 6)."""
-    zero = np.zeros(len(v))
-    return np.column_stack((*flip_euler(*v[:, _DESIRED].T), zero, zero, -v[:, cycle.THRUST]))
+        found.append((topics.PIDNN_WEIGHTS, columns(cycle.WEIGHTS, cycle.COLUMNS)))
+    return Block(recorder, cycle.COLUMNS, found)

@@ -11,6 +11,8 @@ import re
 import struct
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -79,19 +81,30 @@ class Topic:
 
     def pack(self, message_id: int, timestamps_us: npt.NDArray[np.uint64], values: npt.NDArray[np.float64]) -> bytes:
         """k ULog data messages: `timestamps_us` (k,), `values` (k, fields flat). Beyond float32's range is infinite."""
-        rows = np.empty(len(timestamps_us), self.dtype)
-        rows["ulog_header"] = np.void(struct.pack("<HBH", self.dtype.itemsize - 3, DATA_MESSAGE, message_id))
+        dtype, runs = self._packed
+        if values.shape[1] != runs[-1][2]:
+            raise ValueError(f"{self.name}: {values.shape[1]} values a row, it has {runs[-1][2]}")
+        rows = np.empty(len(timestamps_us), dtype)
+        rows["ulog_header"] = np.void(struct.pack("<HBH", dtype.itemsize - 3, DATA_MESSAGE, message_id))
         rows["timestamp"] = timestamps_us
-        at = 0
         with np.errstate(over="ignore"):
-            for name, _, count in self.columns[1:]:
-                width = count or 1
-                part = values[:, at : at + width]
-                rows[name] = part if count is not None else part[:, 0]
-                at += width
-        if at != values.shape[1]:
-            raise ValueError(f"{self.name}: {values.shape[1]} values a row, it has {at}")
+            for name, first, end in runs:
+                rows[name] = values[:, first:end]
         return rows.tobytes()
+
+    @cached_property
+    def _packed(self) -> tuple[np.dtype[Any], list[tuple[str, int, int]]]:
+        """As `dtype`, fields of one type that follow one another as one, and these: name, first value, end."""
+        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [("ulog_header", "V5"), ("timestamp", "<u8")]
+        runs = []
+        first = 0
+        for kind, same in groupby(self.columns[1:], key=itemgetter(1)):
+            width = sum(count or 1 for _, _, count in same)
+            name = f"values {first}"
+            fields.append((name, _TYPES[kind][1], (width,)))
+            runs.append((name, first, first + width))
+            first += width
+        return np.dtype(fields), runs
 
     def arrays(self, buffer: bytes | bytearray | memoryview, count: int) -> dict[str, npt.NDArray[Any]]:
         """The first `count` rows of `buffer`, copied: scalars (count,), arrays (count, length)."""

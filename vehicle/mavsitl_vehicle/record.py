@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mavsitl.dialect import mavlink
-from mavsitl.frames import flip_quaternion
 from mavsitl.geodesy import Origin
 from mavsitl.log import topics
-from mavsitl.log.block import Array, Block, Window, ned
+from mavsitl.log.block import Array, Block, Window, columns, ned
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
 from mavsitl_vehicle import tick
@@ -29,9 +28,6 @@ if TYPE_CHECKING:
     from mavsitl_vehicle.simulation import Simulation
     from mavsitl_vehicle.vehicle import Vehicle
 
-_WIND = slice(tick.LOG_WIND, tick.LOG_WIND + 3)
-_RATE_SETPOINT = slice(tick.LOG_RATE_SETPOINT, tick.LOG_RATE_SETPOINT + 3)
-
 PORTS_US = 1_000_000
 """Between two rows of the ports' counters."""
 
@@ -42,22 +38,20 @@ class Record:
     def __init__(self, recorder: Recorder, flight: Flight, simulation: Simulation, column: int, aboard: bool) -> None:
         """`column`: the vehicle's of the simulation; `aboard`: the nets are, so their weights are logged here."""
         largest = flight.airframe.max_rotor_speed_rad_s
+        truth, rotors, estimate = tick.LOG_TRUTH, tick.LOG_ROTORS, tick.LOG_ESTIMATE
         self._window = Window(
             recorder,
             (
-                (topics.LOCAL_POSITION_TRUTH, lambda v: np.hstack((ned(v[:, 0:3]), ned(v[:, 3:6])))),
-                (topics.ATTITUDE_TRUTH, lambda v: np.column_stack(flip_quaternion(*v[:, 6:10].T))),
-                (topics.ANGULAR_VELOCITY_TRUTH, lambda v: ned(v[:, 10:13])),
-                (topics.LOCAL_POSITION, lambda v: np.hstack((ned(v[:, 17:20]), ned(v[:, 20:23])))),
-                (topics.ATTITUDE, lambda v: np.column_stack(flip_quaternion(*v[:, 23:27].T))),
-                (topics.ANGULAR_VELOCITY, lambda v: ned(v[:, 27:30])),
-                (topics.WIND_TRUTH, lambda v: ned(v[:, _WIND])),
-                (topics.ACTUATOR_MOTORS, lambda v: v[:, 13:17] / largest),
-                (topics.ROTOR_STATUS, lambda v: np.column_stack((v[:, 13:17], v[:, tick.LOG_SATURATED]))),
-                (
-                    topics.RATES_SETPOINT,
-                    lambda v: np.column_stack((ned(v[:, _RATE_SETPOINT]), _thrust_frd(v[:, tick.LOG_THRUST]))),
-                ),
+                (topics.LOCAL_POSITION_TRUTH, columns(truth, truth + 6)),
+                (topics.ATTITUDE_TRUTH, columns(truth + 6, truth + 10)),
+                (topics.ANGULAR_VELOCITY_TRUTH, columns(truth + 10, truth + 13)),
+                (topics.LOCAL_POSITION, columns(estimate, estimate + 6)),
+                (topics.ATTITUDE, columns(estimate + 6, estimate + 10)),
+                (topics.ANGULAR_VELOCITY, columns(estimate + 10, estimate + 13)),
+                (topics.WIND_TRUTH, columns(tick.LOG_WIND, tick.LOG_WIND + 3)),
+                (topics.ACTUATOR_MOTORS, lambda v: v[:, rotors : rotors + 4] / largest),
+                (topics.ROTOR_STATUS, columns(rotors, tick.LOG_SATURATED + 1)),
+                (topics.RATES_SETPOINT, columns(tick.LOG_RATE_SETPOINT, tick.LOG_THRUST_BODY + 3)),
             ),
             partial(simulation.logged, column),
         )
@@ -167,9 +161,3 @@ class SensorRecord:
             )  # fmt: skip
             bx, by, bz, ax, ay, az = sensed.x[ekf.GYRO_BIAS : ekf.GYRO_BIAS + 6, 0].tolist()
             self._bias.append(now_us, bx, -by, -bz, ax, -ay, -az)
-
-
-def _thrust_frd(thrust: Array) -> Array:
-    """PX4's thrust_body: (0, 0, -thrust), (k, 3)."""
-    zero = np.zeros_like(thrust)
-    return np.column_stack((zero, zero, -thrust))

@@ -99,7 +99,8 @@ class Simulation:
         self.gains = rows[tick.GAINS_AT : tick.SIGMA_AT]
         self.sigma = rows[tick.SIGMA_AT : tick.PLANT_AT]
         self.plant = rows[tick.PLANT_AT :]
-        self.estimates: list[list[float]] = self.estimate.T.tolist()
+        self._by_vehicle = self.estimate.T
+        self.estimates: list[list[float]] = self._by_vehicle.tolist()
         self._asked = np.zeros((n, tick.DEMAND_ROWS))
         self._asked_bytes = self._asked.data.cast("B")
         self.demand = self._asked.T
@@ -291,12 +292,13 @@ class Simulation:
                 self._wind_normals.go_on(row)
             if row in self._sensor_normals.due:
                 self._sensor_normals.go_on(row)
-        self._flight_time_s[:] = flight_time_s
+        field = self.field
+        if field.gusty:
+            self._flight_time_s[:] = flight_time_s
         for j, motors in enumerate(self.motors):
             if motors.busy:
                 motors.step(number * self.substeps * self.dt_s, self.x[13:17, j])
         self._tick = number + 1
-        field = self.field
         if self.sensed is not None:
             self._advance_sensed(self.sensed, number)
             return
@@ -304,7 +306,7 @@ class Simulation:
             self._rows, self._asked, self.held, field.state, field.coefficients, self._wind_normals.block,
             self._sensor_normals.block, self._log, self._block, number, self.dt_s, self.substeps,
         )  # fmt: skip
-        self.estimates = self.estimate.T.tolist()
+        self.estimates = self._by_vehicle.tolist()
 
     def logged(self, j: int, count: int) -> tick.Array:
         """(count, tick.LOG_WIDTH) of vehicle `j`: now, and the ticks before it, the oldest first."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mavsitl.compiled import compiled
+from mavsitl.compiled import compiled, inlined
 from mavsitl.control.allocation import allocate
 from mavsitl_vehicle.autopilot.attitude import attitude_error, quaternion_product
 from mavsitl_vehicle.plant.parameters import N_PARAMETERS
@@ -81,14 +81,15 @@ SIGMA_AT = GAINS_AT + GAIN_ROWS  # 4, noise of position m, velocity m/s, attitud
 PLANT_AT = SIGMA_AT + 4
 ROWS = PLANT_AT + N_PARAMETERS
 
-# Columns of a row of the log.
-LOG_TRUTH = 0  # 0:17
-LOG_ESTIMATE = 17  # 17:30
-LOG_WIND = 30  # 30:33
-LOG_RATE_SETPOINT = 33  # 33:36
-LOG_SATURATED = 36
-LOG_THRUST = 37
-LOG_WIDTH = 38
+# Columns of a row of the log, each topic's beside each other, NED and FRD.
+LOG_TRUTH = 0  # 0:13, position, velocity, quaternion, omega, as of `rows`
+LOG_ROTORS = LOG_TRUTH + 13  # 4, rad/s
+LOG_SATURATED = LOG_ROTORS + 4
+LOG_ESTIMATE = LOG_SATURATED + 1  # 13
+LOG_WIND = LOG_ESTIMATE + 13  # 3
+LOG_RATE_SETPOINT = LOG_WIND + 3  # 3
+LOG_THRUST_BODY = LOG_RATE_SETPOINT + 3  # 3, of which the last is written
+LOG_WIDTH = LOG_THRUST_BODY + 3
 
 
 @compiled
@@ -227,17 +228,27 @@ def outer_loop(demand: Array, estimate: Array, gains: Array, inner: Array) -> No
                 inner[RATE_SETPOINT + i, j] = demand[RATE + i, j]
 
 
+@inlined
+def _log_vector(source: Array, at: int, row: Array, to: int, j: int) -> None:
+    row[to, j], row[to + 1, j], row[to + 2, j] = source[at, j], -source[at + 1, j], -source[at + 2, j]
+
+
 @compiled
 def write_log(rows: Array, asked: Array, row: Array) -> None:
     """Fill `row` (LOG_WIDTH, n) of the log with what is now."""
-    for i in range(LOG_RATE_SETPOINT):  # truth, estimate and wind stand one after the other in both
-        for j in range(row.shape[1]):
-            row[i, j] = rows[i, j]
-    for i in range(RATE_SETPOINT, INNER_ROWS):
-        for j in range(row.shape[1]):
-            row[LOG_RATE_SETPOINT + i - RATE_SETPOINT, j] = rows[INNER_AT + i, j]
     for j in range(row.shape[1]):
-        row[LOG_THRUST, j] = asked[j, THRUST]
+        for at, to in ((X, LOG_TRUTH), (ESTIMATE_AT, LOG_ESTIMATE)):
+            _log_vector(rows, at, row, to, j)
+            _log_vector(rows, at + 3, row, to + 3, j)
+            row[to + 6, j] = rows[at + 6, j]
+            _log_vector(rows, at + 7, row, to + 7, j)
+            _log_vector(rows, at + 10, row, to + 10, j)
+        for i in range(4):
+            row[LOG_ROTORS + i, j] = rows[X + 13 + i, j]
+        row[LOG_SATURATED, j] = rows[INNER_AT + SATURATED, j]
+        _log_vector(rows, WIND_AT, row, LOG_WIND, j)
+        _log_vector(rows, INNER_AT + RATE_SETPOINT, row, LOG_RATE_SETPOINT, j)
+        row[LOG_THRUST_BODY + 2, j] = -asked[j, THRUST]
 
 
 @compiled

@@ -39,7 +39,8 @@ class LandDetector:
         """`knows_height`: the ground is at height 0. Else the take-off tells where it was, and a landing is what
         stands still on little thrust.
         """
-        self._become(ON_GROUND)
+        self.state = ON_GROUND
+        self.on_ground = True
         self.held = clamped
         self.released_us: int | None = None
         self._hover_thrust = hover_thrust

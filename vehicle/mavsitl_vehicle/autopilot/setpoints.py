@@ -123,7 +123,7 @@ ATTITUDE_TARGET_FIELDS = tuple(
     for name in ("q", "body_roll_rate", "body_pitch_rate", "body_yaw_rate", "thrust", "type_mask", "thrust_body")
     if name in mavlink.MAVLink_set_attitude_target_message.fieldnames
 )
-"""Of SET_ATTITUDE_TARGET, what `from_attitude_target` takes, arrays by element; `thrust_body` where the dialect has it."""
+"""Of SET_ATTITUDE_TARGET, what `from_attitude_target` takes, arrays by element; with `thrust_body` where there is one."""
 
 
 def from_attitude_target(
