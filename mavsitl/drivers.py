@@ -230,7 +230,9 @@ def fly_in_memory(
         for datagram in vehicle.datagrams(0, combine=True):
             hear(FROM_VEHICLE, now_us, datagram)
             ground.receive(0, datagram)
-            ground_us = max(ground_us, ground.vehicle_time_us)
+            stamp_us = ground.vehicle_time_us
+            if stamp_us > ground_us:
+                ground_us = stamp_us
             ground.step(ground_us)
             for answer in ground.datagrams(0, combine=True):
                 if not left:

@@ -86,7 +86,8 @@ class Controller:
     ) -> Demand:
         """One control cycle at flight time `time_s`; fills `row`, (cycle.COLUMNS,), where the last four are columns."""
         self.reference.move(time_s)
-        return self._cycle(
+        control = self._cycle
+        return control(
             self._memory, state.state, self.reference.now, row,
             state.stamp_us, frames, lost, rejected, age_us,
         )  # fmt: skip
@@ -333,13 +334,13 @@ class Ground:
         self._due_us = NOW if self._texts.waiting else handshake.due_us
 
     def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
-        return self._node.datagrams(combine=combine)
+        return self._node.datagrams(combine)
 
     def _control(self, now_us: int, age_us: int) -> None:
         """On a new state, `age_us` old."""
         handshake, state = self._handshake, self._observer
         target = handshake.target
-        if target is None or self.finished:
+        if target is None or handshake.phase in ENDED:
             return
         stamp_us, released_us = state.stamp_us, self._released_us
         if released_us is None or not (handshake.in_control or handshake.phase is Phase.STOP):
@@ -352,7 +353,8 @@ class Ground:
             time_s, state, self._rows.row(stamp_us),
             counters.frames, 0 if source is None else source.lost, counters.rejected, age_us,
         )  # fmt: skip
-        self._send_demand(self._node, target, stamp_us, demand)
+        send_demand = self._send_demand
+        send_demand(self._node, target, stamp_us, demand)
         if time_s >= self._scenario.duration_s and handshake.phase is Phase.FLY:
             handshake.finish(now_us)
             self._due_us = NOW

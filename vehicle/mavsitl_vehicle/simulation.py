@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from math import nan, radians
+from math import radians
 
 import msgspec
 import numpy as np
@@ -32,10 +32,11 @@ TURBULENCE_HEIGHT_M = 6.096
 BLOCK_TICKS = 250
 """Normals are drawn for this many ticks at once."""
 
-_PACK_DEMAND = struct.Struct(f"={tick.DEMAND_ROWS}d").pack_into
+# Rows of `asked` from KIND to the last that a kind of demand has; between them are zeros.
+_PACK_ATTITUDE = struct.Struct("=d 4d 24x 24x d d").pack_into
+_PACK_RATE = struct.Struct("=d 32x 3d 24x d").pack_into
+_PACK_TORQUE = struct.Struct("=d 32x 24x 3d d").pack_into
 _DEMAND_BYTES = 8 * tick.DEMAND_ROWS
-_NOTHING = (0.0, 0.0, 0.0)
-_LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 WARM_UP_US = 1_000_000
 """In so much time at rest a filter uses everything that it has."""
@@ -155,19 +156,18 @@ class Simulation:
 
     def set_demand(self, j: int, setpoint: Setpoint | None) -> None:
         """What vehicle `j`'s inner loops follow during the next tick; None stops its rotors."""
-        if isinstance(setpoint, AttitudeSetpoint):
-            kind, attitude, rate, torque = tick.ATTITUDE_KIND, setpoint.attitude, _NOTHING, _NOTHING
-            yaw_rate = setpoint.yaw_rate_rad_s
+        asked, at = self._asked_bytes, j * _DEMAND_BYTES
+        if isinstance(setpoint, RateSetpoint):
+            p, q, r = setpoint.omega_flu_rad_s
+            _PACK_RATE(asked, at, tick.RATE_KIND, p, q, r, setpoint.thrust)
+        elif isinstance(setpoint, AttitudeSetpoint):
+            w, x, y, z = setpoint.attitude
+            _PACK_ATTITUDE(asked, at, tick.ATTITUDE_KIND, w, x, y, z, setpoint.thrust, setpoint.yaw_rate_rad_s)
         elif setpoint is None:
             self.demand[tick.KIND, j] = tick.STOPPED
-            return
-        elif isinstance(setpoint, RateSetpoint):
-            kind, attitude, rate, torque = tick.RATE_KIND, _LEVEL, setpoint.omega_flu_rad_s, _NOTHING
-            yaw_rate = nan
         else:
-            kind, attitude, rate, torque = tick.TORQUE_KIND, _LEVEL, _NOTHING, setpoint.torque
-            yaw_rate = nan
-        _PACK_DEMAND(self._asked_bytes, j * _DEMAND_BYTES, kind, *attitude, *rate, *torque, setpoint.thrust, yaw_rate)
+            roll, pitch, yaw = setpoint.torque
+            _PACK_TORQUE(asked, at, tick.TORQUE_KIND, roll, pitch, yaw, setpoint.thrust)
 
     @property
     def estimator_status(self) -> EstimatorStatus:

@@ -377,7 +377,7 @@ class Vehicle:
 
     def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
         """What goes out on a link: one message a datagram, or all of a tick in one (`combine`)."""
-        return self.autopilot.ports[port].node.datagrams(combine=combine)
+        return self.autopilot.ports[port].node.datagrams(combine)
 
     def _inner_law(self, law: SeatedLaw, setpoint: Setpoint | None) -> Setpoint | None:
         """With the PIDNN aboard, an off-board attitude becomes a torque by it; all else passes."""

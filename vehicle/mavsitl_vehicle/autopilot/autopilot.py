@@ -155,6 +155,8 @@ class Autopilot:
         self.wind: telemetry.Wind | None = None
         """As estimated; None: not known."""
         self.health = Health()
+        self._healthy = self.health
+        """The same, whatever the mode says; and why that does not allow arming."""
         self._health_refusal: str | None = None
         self.attitude_setpoint: Setpoint | None = None
         """What the inner loops follow."""
@@ -757,7 +759,7 @@ class Autopilot:
         x, y, z = self.estimate[:3]
         self._fence_breach = self._plan_watch.breach((x, y, z))
         needs, valid, sensors = modes.TABLE[self.commander.intended].needs, self.valid, self._status.sensors
-        self.health = Health(
+        health = Health(
             gyro=sensors.gyro,
             accelerometer=sensors.accelerometer,
             magnetometer=sensors.magnetometer,
@@ -775,8 +777,11 @@ class Autopilot:
             fence_breached=self._fence_breach is not None and self._plan_watch.acts,
             position_needed=Need.POSITION in needs,
         )
-        self._health_refusal = summary(self.health)
-        self.health = self.health._replace(mode_refusal=self.commander.mode_refusal())
+        if health != self._healthy:
+            self._healthy = health
+            self._health_refusal = summary(health)
+        mode_refusal = self.commander.mode_refusal()
+        self.health = health if mode_refusal is None else health._replace(mode_refusal=mode_refusal)
 
     def _watch_plan(self, now_us: int) -> None:
         """What fail-safes must not wait for until the house is kept."""

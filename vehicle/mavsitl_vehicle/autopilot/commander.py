@@ -14,6 +14,8 @@ from math import inf, radians
 from operator import attrgetter
 from typing import NamedTuple
 
+from msgspec import Struct
+
 from mavsitl.dialect import mavlink
 from mavsitl_vehicle.autopilot import modes
 from mavsitl_vehicle.autopilot.modes import Control, Mode, Need
@@ -102,7 +104,7 @@ EXCEPTION_BITS = {
 """Of COM_RCL_EXCEPT and COM_DLL_EXCEPT, by the mode that the user chose."""
 
 
-class Situation(NamedTuple):
+class Situation(Struct, frozen=True):
     """What the commander looks at, once a step. Ages are microseconds since the last good one; None: there was none."""
 
     landed: bool
@@ -717,10 +719,10 @@ def _position_inaccurate(commander: Commander) -> bool:
 
 
 def _estimate_lost(need: Need, name: str) -> Callable[[Commander], bool]:
-    valid = attrgetter(f"situation.{name}_valid")
+    valid = attrgetter(f"{name}_valid")
 
     def tripped(commander: Commander) -> bool:
-        return not valid(commander) and need in modes.TABLE[commander.intended].needs
+        return not valid(commander.situation) and need in modes.TABLE[commander.intended].needs
 
     return tripped
 
@@ -735,11 +737,11 @@ def _fallback_action(commander: Commander) -> Action:
 
 def _tilted(axis: str, parameter: str) -> Callable[[Commander], bool]:
     """Not where the mode turns the vehicle by rates: ACRO, and OFFBOARD with rates."""
-    angle_rad = attrgetter(f"situation.{axis}_rad")
+    angle_rad = attrgetter(f"{axis}_rad")
 
     def tripped(commander: Commander) -> bool:
         limit_deg = commander.parameters[parameter]
-        if not limit_deg or not abs(angle_rad(commander)) > radians(limit_deg):
+        if not limit_deg or not abs(angle_rad(commander.situation)) > radians(limit_deg):
             return False
         if commander.mode is Mode.OFFBOARD:
             return Need.ATTITUDE in commander.situation.stream_needs

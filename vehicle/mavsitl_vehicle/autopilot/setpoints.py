@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from math import atan2, cos, isfinite, nan, pi, remainder, sin, sqrt
 from typing import Any, NamedTuple, Protocol
 
+from msgspec import Struct
+
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Quaternion, Vector, flip_quaternion, flip_vector
 from mavsitl.quaternion import rotate
@@ -39,7 +41,7 @@ NORM_TOLERANCE = 0.01
 """How far a setpoint's quaternion may be from unit length; float32 and honest clients stay within 1e-6."""
 
 
-class AttitudeSetpoint(NamedTuple):
+class AttitudeSetpoint(Struct, frozen=True):
     """Hold `attitude` (FLU -> NWU); turn the heading at `yaw_rate_rad_s` about the world's z axis (NaN: not asked)."""
 
     attitude: Quaternion
@@ -47,14 +49,14 @@ class AttitudeSetpoint(NamedTuple):
     thrust: float
 
 
-class RateSetpoint(NamedTuple):
+class RateSetpoint(Struct, frozen=True):
     """Hold the body rates (FLU); a NaN yaw rate means 'as it is'."""
 
     omega_flu_rad_s: Vector
     thrust: float
 
 
-class TorqueSetpoint(NamedTuple):
+class TorqueSetpoint(Struct, frozen=True):
     """Body torque in shares of the airframe's largest (FLU, -1..1) and collective thrust (0..1): U_1..U_4."""
 
     torque: Vector
@@ -123,7 +125,7 @@ ATTITUDE_TARGET_FIELDS = tuple(
     for name in ("q", "body_roll_rate", "body_pitch_rate", "body_yaw_rate", "thrust", "type_mask", "thrust_body")
     if name in mavlink.MAVLink_set_attitude_target_message.fieldnames
 )
-"""Of SET_ATTITUDE_TARGET, what `from_attitude_target` takes, arrays by element; with `thrust_body` where there is one."""
+"""Of SET_ATTITUDE_TARGET, what `from_attitude_target` takes, arrays by element; `thrust_body` where there is one."""
 
 
 def from_attitude_target(
