@@ -266,9 +266,9 @@ class Autopilot:
             self.queue_text(mavlink.MAV_SEVERITY_ERROR, text)
 
     def _on_attitude_target(self, frame: Frame, now_us: int) -> None:
-        time_ms, *asked = _read_attitude_target(frame)
-        self.token_us = time_ms * 1000
-        self._take(setpoints.from_attitude_target(*asked), now_us)
+        fields = _read_attitude_target(frame)
+        self.token_us = fields[0] * 1000
+        self._take(setpoints.from_attitude_target(*fields[1:]), now_us)
 
     def _on_actuator_control_target(self, frame: Frame, now_us: int) -> None:
         message = frame.message
