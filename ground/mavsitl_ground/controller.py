@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mavsitl.codec import Frame, packer
+from mavsitl.compiled import direct
 from mavsitl.control.arrays import Floats, Record, record
 from mavsitl.control.filters import FirstOrder
 from mavsitl.control.inner_loop import InnerLoop
@@ -70,11 +71,12 @@ class Controller:
         self.learns = settings.level != "attitude" and settings.law == "pidnn"
         """A PIDNN is here, not aboard or nowhere: rows of the log have its weights."""
         if settings.level == "attitude":
-            self._cycle = cycle.attitude_cycle
+            function = cycle.attitude_cycle
         else:
-            self._cycle = cycle.net_cycle if self.learns else cycle.pid_cycle
+            function = cycle.net_cycle if self.learns else cycle.pid_cycle
         # Compiles, or reads the cache, before the clock runs.
-        self.update(0.0, Observer(settings.telemetry), np.zeros(cycle.COLUMNS), 0, 0, 0, 0)
+        state, row = Observer(settings.telemetry).state, np.zeros(cycle.COLUMNS)
+        self._cycle = direct(function, self._memory, state, self.reference.now, row, 0, 0, 0, 0, 0)
         self.reset()
 
     def reset(self) -> None:

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from mavsitl.codec import Frame, reader
-from mavsitl.compiled import compiled, inlined
+from mavsitl.compiled import compiled, direct, inlined
 from mavsitl.control.arrays import Floats, Record, record
 from mavsitl.control.rotation import euler_rates, normalise, rotate, to_euler
 from mavsitl.dialect import mavlink
@@ -141,7 +141,7 @@ class Observer:
         # Compiles, or reads the cache, before the clock runs; what is not newer changes nothing.
         still = (0.0, 0.0, 0.0)
         if source != "split":
-            take_odometry(*still, *IDENTITY, *still, *still, False, False, self.state)
+            self._take_odometry = direct(take_odometry, *still, *IDENTITY, *still, *still, False, False, self.state)
         if source != "odometry":
             take_attitude(IDENTITY, *still, False, self.state)
             take_linear(*still, *still, False, self.state)
@@ -241,6 +241,7 @@ class Observer:
             return
         newer = stamp_us >= self.stamp_us and stamp_us >= self._position_us
         in_body = child == mavlink.MAV_FRAME_BODY_FRD
+        take_odometry = self._take_odometry
         if not take_odometry(x, y, z, q_w, q_x, q_y, q_z, vx, vy, vz, p, q_rate, r, in_body, newer, self.state):
             return
         if newer:
