@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from mavsitl import seeds
+from mavsitl.compiled import direct
 from mavsitl.frames import Vector
 from mavsitl.quaternion import conjugate, rotate, to_euler
 from mavsitl.scenario import DrydenMil, Flight, Gust, Steady, Wind
@@ -302,7 +303,8 @@ class Simulation:
         if self.sensed is not None:
             self._advance_sensed(self.sensed, number)
             return
-        tick.advance(
+        advance = self._advance
+        advance(
             self._rows, self._asked, self.held, field.state, field.coefficients, self._wind_normals.block,
             self._sensor_normals.block, self._log, self._block, number, self.dt_s, self.substeps,
         )  # fmt: skip
@@ -360,12 +362,11 @@ class Simulation:
         if self.sensed is not None:
             self._warm_up_sensed(rows, asked)
             return
-        for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
-            asked[:, tick.KIND] = kind
-            tick.advance(
-                rows, asked, self.held, self.field.state.copy(), self.field.coefficients, self._wind_normals.block,
-                self._sensor_normals.block, self._log.copy(), self._block, 0, self.dt_s, self.substeps,
-            )  # fmt: skip
+        self._advance = direct(
+            tick.advance,
+            rows, asked, self.held, self.field.state.copy(), self.field.coefficients, self._wind_normals.block,
+            self._sensor_normals.block, self._log.copy(), self._block, 0, self.dt_s, self.substeps,
+        )  # fmt: skip
 
     def _warm_up_sensed(self, rows: tick.Array, asked: tick.Array) -> None:
         sensed, field = self._make_sensed(0, Failures(), range(self.n)), self.field
