@@ -110,3 +110,21 @@ def fused(function: F) -> F:
 
 if JIT:
     _set_up_cache()
+
+
+def direct(function: F, *arguments: Any) -> F:
+    """The code of a `compiled` function for arguments of the types of these, with which it is called once.
+
+    numba looks at the type of every argument in every call, which for a record takes as long as a law's step. Here
+    nobody looks: all later calls have to have the same types, of arrays also the layout. It is for what is called in
+    every period, by the one place that makes its arguments.
+    """
+    function(*arguments)
+    if not JIT:
+        return function
+    import numba
+
+    types = tuple(numba.typeof(argument) for argument in arguments)
+    found = cast("Any", function).overloads[types]
+    # numba does not document it: of a version that has it no more, calls take longer and do the same.
+    return cast("F", getattr(found, "entry_point", function))

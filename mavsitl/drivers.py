@@ -14,7 +14,7 @@ import contextlib
 import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from mavsitl.clock import CATCH_UP_US, LatenessHistogram, PacedClock, monotonic_us
@@ -24,7 +24,7 @@ from mavsitl.link.budget import Excess, FairQueue, InputBudget
 from mavsitl.link.exchange import EXCHANGE_BYTES, HELLO, pack, unpack
 from mavsitl.link.sockets import wait_any
 from mavsitl.link.udp import ConnectedUdp
-from mavsitl.log.tlog import Direction, TlogWriter, WireHash
+from mavsitl.log.tlog import Direction, Heard, TlogWriter, WireHash
 
 if TYPE_CHECKING:
     from mavsitl.ask import Ask
@@ -118,32 +118,59 @@ Progress = Callable[[float], None]
 """Flight time in seconds, negative before the release."""
 
 
-@dataclass
 class Tap:
-    """What hears every datagram: the digest of the wire, a tlog, and whatever else is to be flushed as time goes."""
+    """What hears every datagram: the digest of the wire, a tlog, and whatever else is to be flushed as time goes.
 
-    wire: WireHash = field(default_factory=WireHash)
-    tlog: TlogWriter | None = None
-    record: Callable[[int], None] | None = None
-    """Told the time once a second, before the flush: for what is logged at that rate."""
-    flush: Callable[[], None] | None = None
-    started_us: int | None = None
-    """Wall clock at the first datagram of the ground: what came before is start-up, not flying."""
-    _flushed_us: int = 0
-    _flushed_wall_us: int = 0
+    What is heard is only kept, and taken in at the next `tick`: some hundred datagrams at once cost half.
+
+    Attributes:
+        record: told the time once a second, before the flush: for what is logged at that rate.
+        started_us: wall clock at the first datagram of the ground: what came before is start-up, not flying.
+    """
+
+    def __init__(
+        self,
+        tlog: TlogWriter | None = None,
+        record: Callable[[int], None] | None = None,
+        flush: Callable[[], None] | None = None,
+    ) -> None:
+        self.tlog = tlog
+        self.record = record
+        self.flush = flush
+        self.started_us: int | None = None
+        self._wire = WireHash()
+        self._heard: list[Heard] = []
+        self._flushed_us = 0
+        self._flushed_wall_us = 0
 
     def hear(self, direction: Direction, now_us: int, datagram: bytes) -> None:
-        self.wire.update(direction, datagram)
-        if direction is FROM_GROUND:
-            if self.started_us is None:
-                self.started_us = monotonic_us()
-            if self.tlog is not None and SETUP_SIGNING_ID in datagram:  # a vehicle sends no key, and passes none on
-                datagram = _without_keys(datagram)
+        self._heard.append((direction, now_us, datagram))
+        if self.started_us is None and direction is FROM_GROUND:
+            self.started_us = monotonic_us()
+
+    @property
+    def wire(self) -> WireHash:
+        """Of everything heard so far."""
+        self._take_in()
+        return self._wire
+
+    def close(self) -> None:
+        """Take in the last, and close the tlog."""
+        try:
+            self._take_in()
+        finally:
+            if self.tlog is not None:
+                self.tlog.close()
+
+    def _take_in(self) -> None:
+        heard, self._heard = self._heard, []
+        self._wire.update(heard)
         if self.tlog is not None:
-            self.tlog.write(now_us, datagram)
+            self.tlog.write([_without_keys(each) if SETUP_SIGNING_ID in each[2] else each for each in heard])
 
     def tick(self, now_us: int, wall_us: int = 0) -> None:
-        """Once a control period. `wall_us`: in real time, where simulated time may be slower than the clock."""
+        """Once a control period, or every few. `wall_us`: in real time, where simulated time may be slower."""
+        self._take_in()
         if now_us - self._flushed_us >= FLUSH_INTERVAL_US or wall_us - self._flushed_wall_us >= FLUSH_WALL_US:
             self._flushed_us = now_us
             self._flushed_wall_us = wall_us
@@ -155,12 +182,17 @@ class Tap:
                 self.tlog.flush()
 
 
-def _without_keys(datagram: bytes) -> bytes:
-    """The good frames that are no SETUP_SIGNING: a key is not to be read in a log."""
+def _without_keys(heard: Heard) -> Heard:
+    """Of the ground's the good frames that are no SETUP_SIGNING: a key is not to be read in a log.
+
+    A vehicle sends no key, and passes none on.
+    """
     from mavsitl.codec import parse
 
-    kept = [frame.raw for frame in parse(datagram) if frame.message_id != SETUP_SIGNING]
-    return b"".join(kept)
+    direction, now_us, datagram = heard
+    if direction is FROM_GROUND:
+        datagram = b"".join(frame.raw for frame in parse(datagram) if frame.message_id != SETUP_SIGNING)
+    return direction, now_us, datagram
 
 
 class _Throttle:
@@ -228,7 +260,9 @@ def fly_in_memory(
         for datagram in vehicle.datagrams(0, combine=True):
             hear(FROM_VEHICLE, now_us, datagram)
             ground.receive(0, datagram)
-            ground_us = max(ground_us, ground.vehicle_time_us)
+            stamp_us = ground.vehicle_time_us
+            if stamp_us > ground_us:
+                ground_us = stamp_us
             ground.step(ground_us)
             for answer in ground.datagrams(0, combine=True):
                 if not left:

@@ -212,12 +212,11 @@ def _logs(
     info = information(flight, boot_us)
     parameters = {} if end == "vehicle" else flight.airframe.parameters | flight.scenario.parameters
     with UlogWriter(folder / name, info, parameters, topics=topics, failed=failed) as writer:
-        tlog = TlogWriter(folder / WIRE_LOG, failed) if end == "vehicle" else None
+        tap = Tap(TlogWriter(folder / WIRE_LOG, failed) if end == "vehicle" else None, flush=writer.flush)
         try:
-            yield writer, Tap(tlog=tlog, flush=writer.flush)
+            yield writer, tap
         finally:
-            if tlog is not None:
-                tlog.close()
+            tap.close()
 
 
 def _keep_older(path: Path) -> None:

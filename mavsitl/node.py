@@ -39,7 +39,7 @@ class SourceStatistics:
     restarts: int = 0
     """times the sender began to count anew"""
     heard: int = 0
-    """the node's count of frames when this source was last heard"""
+    """the node's count of good frames when this source was last heard"""
     late_run: int = 0
 
     @property
@@ -52,7 +52,8 @@ class SourceStatistics:
         self.received += 1
         step = (sequence - self.sequence) & 0xFF
         if 0 < step < _LATE:
-            self.lost += step - 1
+            if step > 1:
+                self.lost += step - 1
             self.sequence = sequence
             self.late_run = 0
             return
@@ -90,6 +91,7 @@ class Node:
         counters: what became of the input, see `mavsitl.codec.Counters`.
         own_frames: frames dropped because they carry the node's own address (an echo).
         sources: statistics by (system id, component id), at most `MAX_SOURCES`.
+        sequence: number of the next frame, 0 to 255.
         signing: signs and checks what passes, see `mavsitl.signing`; None for a link that knows no signatures.
         tamper: makes the endpoint misbehave, see `mavsitl.chaos`; None for one that behaves.
     """
@@ -105,13 +107,13 @@ class Node:
         self.signing = signing
         self.tamper: Tamper | None = None
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
-        self._sequence = 0
-        self._frames_heard = 0
+        self.sequence = 0
+        self._addresses = {(system, component) for system in (0, system_id) for component in (0, component_id)}
         self._outbox: list[bytes] = []
 
     def continue_from(self, sequence: int) -> None:
         """Let the next frame carry this sequence number, 0 to 255: others of this component were sent before."""
-        self._sequence = sequence & 0xFF
+        self.sequence = sequence & 0xFF
 
     def send(self, pack: Packer, *fields: object) -> None:
         """Queue one frame: `pack` is a function that `mavsitl.codec.packer` made, `fields` are its fields.
@@ -119,13 +121,21 @@ class Node:
         Raises:
             EncodeError: the fields do not fit; nothing is queued and no sequence number used.
         """
-        self._outbox.append(pack(self._sequence, self.system_id, self.component_id, *fields))
-        self._sequence = (self._sequence + 1) & 0xFF
+        self._outbox.append(pack(self.sequence, self.system_id, self.component_id, *fields))
+        self.sequence = (self.sequence + 1) & 0xFF
+
+    def queue(self, frame: bytes) -> None:
+        """Queue a frame of its own that was packed with `sequence` and the node's address: what goes out every period.
+
+        As `send`, and cheaper than handing the fields on.
+        """
+        self._outbox.append(frame)
+        self.sequence = (self.sequence + 1) & 0xFF
 
     def send_message(self, message: Message) -> None:
         """Queue one message object. Raises `EncodeError` as `send` does."""
-        self._outbox.append(encode(message, self._sequence, self.system_id, self.component_id))
-        self._sequence = (self._sequence + 1) & 0xFF
+        self._outbox.append(encode(message, self.sequence, self.system_id, self.component_id))
+        self.sequence = (self.sequence + 1) & 0xFF
 
     def forward(self, frame: bytes) -> None:
         """Queue another component's frame as it is, with its sequence number and signature."""
@@ -140,16 +150,16 @@ class Node:
         """Drop the queued frames but the first `kept`, as a link does that is down: their numbers are used."""
         del self._outbox[kept:]
 
-    def datagrams(self, max_bytes: int = DATAGRAM_BYTES, combine: bool = False) -> list[bytes]:
+    def datagrams(self, combine: bool = False, max_bytes: int = DATAGRAM_BYTES) -> list[bytes]:
         """Take the queued frames as datagrams, in order.
 
         Args:
-            max_bytes: length of the longest combined datagram; a single longer frame still goes, alone.
             combine: put as many frames into a datagram as fit, instead of one frame each, which is what PX4 does.
+            max_bytes: length of the longest combined datagram; a single longer frame still goes, alone.
         """
         frames, self._outbox = self._outbox, []
         if self.tamper is not None:
-            frames, self._sequence = self.tamper.outgoing(frames, self._sequence)
+            frames, self.sequence = self.tamper.outgoing(frames, self.sequence)
         if self.signing is not None:
             frames = self.signing.outgoing(frames, (self.system_id, self.component_id))
         if self.tamper is not None:
@@ -179,21 +189,20 @@ class Node:
         frames = parse(datagram, self.counters)
         if self.signing is not None:
             frames = self.signing.incoming(frames, (self.system_id, self.component_id))
-        own, sources = self.address, self.sources
-        echoed = False
+        sources, heard, echoed = self.sources, self.counters.frames, False
         for frame in frames:
             sender = (frame.system_id, frame.component_id)
-            if sender == own:
-                echoed = True
-                continue
             source = sources.get(sender)
-            if source is None:
+            if source is not None:
+                source.update(frame.sequence)
+            elif sender != self.address:
                 source = self._meet(sender, frame.sequence)
             else:
-                source.update(frame.sequence)
-            self._frames_heard = source.heard = self._frames_heard + 1
+                echoed = True
+                continue
+            source.heard = heard
         if echoed:
-            others = [frame for frame in frames if (frame.system_id, frame.component_id) != own]
+            others = [frame for frame in frames if (frame.system_id, frame.component_id) != self.address]
             self.own_frames += len(frames) - len(others)
             return others
         return frames
@@ -208,8 +217,7 @@ class Node:
 
         A message without target fields is meant for everybody.
         """
-        target_system, target_component = frame.target
-        return target_system in (0, self.system_id) and target_component in (0, self.component_id)
+        return frame.target in self._addresses
 
     def _meet(self, sender: tuple[int, int], sequence: int) -> SourceStatistics:
         """A sender not heard before, or forgotten."""

@@ -49,6 +49,7 @@ from mavsitl_vehicle.autopilot.commander import FAILSAFES, Action, By, Commander
 from mavsitl_vehicle.autopilot.modes import Control, Mode, Need
 from mavsitl_vehicle.autopilot.parameters import TABLE, Parameter
 from mavsitl_vehicle.vehicle import Vehicle
+from msgspec.structs import replace
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.typing import ExtensionMetadata
@@ -433,7 +434,7 @@ def flying(mode: Mode, parameters: Mapping[str, float]) -> Commander:
     """A commander, armed and in the air, to which nothing has happened yet."""
     commander = Commander(parameters, lambda severity, text: None)
     commander.home_set = True
-    commander.step(0, WELL._replace(landed=True))
+    commander.step(0, replace(WELL, landed=True))
     commander.request_arm(True, False, 0)
     commander.step(0, WELL)
     commander.request_mode(mode, "")
@@ -511,7 +512,7 @@ def failsafe_changes(row: Failsafe) -> Iterator[Change]:
     found: dict[Mode, list[Mode]] = {}
     for mode in Mode:
         commander = flying(mode, values(**parameters))
-        tripped = WELL._replace(**situation)
+        tripped = replace(WELL, **situation)
         for now_us in (LONG_US, 2 * LONG_US, 3 * LONG_US):
             commander.step(now_us, tripped)
         if commander.armed and commander.mode is not mode:

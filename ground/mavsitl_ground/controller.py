@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mavsitl.codec import Frame, packer
+from mavsitl.compiled import direct
 from mavsitl.control.arrays import Floats, Record, record
 from mavsitl.control.filters import FirstOrder
 from mavsitl.control.inner_loop import InnerLoop
@@ -72,11 +73,12 @@ class Controller:
         self.learns = settings.level != "attitude" and settings.law == "pidnn"
         """A PIDNN is here, not aboard or nowhere: rows of the log have its weights."""
         if settings.level == "attitude":
-            self._cycle = cycle.attitude_cycle
+            function = cycle.attitude_cycle
         else:
-            self._cycle = cycle.net_cycle if self.learns else cycle.pid_cycle
+            function = cycle.net_cycle if self.learns else cycle.pid_cycle
         # Compiles, or reads the cache, before the clock runs.
-        self.update(0.0, Observer(settings.telemetry), np.zeros(cycle.COLUMNS), 0, 0, 0, 0)
+        state, row = Observer(settings.telemetry).state, np.zeros(cycle.COLUMNS)
+        self._cycle = direct(function, self._memory, state, self.reference.now, row, 0, 0, 0, 0, 0)
         self.reset()
 
     def reset(self) -> None:
@@ -88,7 +90,8 @@ class Controller:
     ) -> Demand:
         """One control cycle at flight time `time_s`; fills `row`, (cycle.COLUMNS,), where the last four are columns."""
         self.reference.move(time_s)
-        return self._cycle(
+        control = self._cycle
+        return control(
             self._memory, state.state, self.reference.now, row,
             state.stamp_us, frames, lost, rejected, age_us,
         )  # fmt: skip
@@ -306,11 +309,11 @@ class Ground:
         state = self._observer
         if now_us >= self._due_us or state.restarted:
             self._attend(now_us)
-        if state.fresh and state.valid(now_us):
-            state.take()
+        age_us = state.take(now_us)
+        if age_us is not None:
             if self._scenario.ground_contact:
                 self._watch_crash(now_us)
-            self._control(now_us)
+            self._control(now_us, age_us)
         if now_us - self._heartbeat_us >= HEARTBEAT_INTERVAL_US and not self.finished:
             self._heartbeat_us = now_us
             self._node.send(
@@ -342,12 +345,13 @@ class Ground:
         self._due_us = NOW if self._texts.waiting else handshake.due_us
 
     def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
-        return self._node.datagrams(combine=combine)
+        return self._node.datagrams(combine)
 
-    def _control(self, now_us: int) -> None:
+    def _control(self, now_us: int, age_us: int) -> None:
+        """On a new state, `age_us` old."""
         handshake, state = self._handshake, self._observer
         target = handshake.target
-        if target is None or self.finished:
+        if target is None or handshake.phase in ENDED:
             return
         stamp_us, released_us = state.stamp_us, self._released_us
         if released_us is None or not (handshake.in_control or handshake.phase is Phase.STOP):
@@ -358,9 +362,10 @@ class Ground:
         counters, source = self._node.counters, self._node.sources.get(target)
         demand = self._controller.update(
             time_s, state, self._rows.row(stamp_us),
-            counters.frames, 0 if source is None else source.lost, counters.rejected, state.age_us(now_us) or 0,
+            counters.frames, 0 if source is None else source.lost, counters.rejected, age_us,
         )  # fmt: skip
-        self._send_demand(self._node, target, stamp_us, demand)
+        send_demand = self._send_demand
+        send_demand(self._node, target, stamp_us, demand)
         if time_s >= self._scenario.duration_s and handshake.phase is Phase.FLY:
             handshake.finish(now_us)
             self._due_us = NOW

@@ -27,18 +27,19 @@ NONE, OBSERVER, ORACLE = range(3)
 LEVELS = ("attitude", "body_rate", "torque")
 ATTITUDE, BODY_RATE, TORQUE = range(3)
 
-# Columns of a row of the ground's log, NWU and FLU.
+# Columns of a row of the ground's log, each topic's beside each other. NED and FRD:
 POSITION = 0  # 0:3, the reference's
 VELOCITY = 3  # 3:6
 YAW = 6
 DESIRED = 7  # 7:10, phi_d, theta_d, psi_d
-THRUST = 10  # of the largest
-U1 = 11  # N
-ACCELERATION = 12  # 12:15, rad/s^2
-WIND = 15  # 15:18, W_1..W_3
-LINK = 18  # 18:22, frames, lost, rejected, age us
-WEIGHTS = 22  # 22:31, (P, I, D) x (roll, pitch, yaw)
-COLUMNS = 31
+THRUST_BODY = 10  # 10:13, of the largest; of these the last is written
+# The paper's frame:
+U1 = 13  # N
+ACCELERATION = 14  # 14:17, rad/s^2
+WIND = 17  # 17:20, W_1..W_3
+LINK = 20  # 20:24, frames, lost, rejected, age us
+WEIGHTS = 24  # 24:33, (P, I, D) of roll, pitch and yaw
+COLUMNS = 33
 
 Demand: TypeAlias = tuple[Quaternion, float, float, float, float]
 """Attitude FRD -> NED; about x, y, z of FRD the body rates in rad/s or, at level `torque`, shares of the largest
@@ -102,13 +103,14 @@ def _direct(own: Any, state: Any, acceleration: Floats) -> Demand:
 @inlined
 def _log(own: Any, wanted: Any, row: Floats, thrust: float, frames: int, lost: int, rejected: int, age_us: int) -> None:
     """The row but for what the inner loop says."""
+    position, velocity, desired = wanted["position"], wanted["velocity"], own["desired"]
+    row[POSITION], row[POSITION + 1], row[POSITION + 2] = position[0, 0], -position[1, 0], -position[2, 0]
+    row[VELOCITY], row[VELOCITY + 1], row[VELOCITY + 2] = velocity[0, 0], -velocity[1, 0], -velocity[2, 0]
+    row[YAW] = -wanted["yaw"][0]
+    row[DESIRED], row[DESIRED + 1], row[DESIRED + 2] = desired[0, 0], -desired[1, 0], -desired[2, 0]
+    row[THRUST_BODY + 2] = -thrust
     for axis in range(3):
-        row[POSITION + axis] = wanted["position"][axis, 0]
-        row[VELOCITY + axis] = wanted["velocity"][axis, 0]
-        row[DESIRED + axis] = own["desired"][axis, 0]
         row[WIND + axis] = own["wind"][axis, 0]
-    row[YAW] = wanted["yaw"][0]
-    row[THRUST] = thrust
     row[U1] = own["thrust_n"]
     row[LINK] = frames
     row[LINK + 1] = lost
@@ -176,5 +178,5 @@ def net_cycle(
     for axis in range(3):
         row[ACCELERATION + axis] = law["out"][axis, 0]
         for output in range(3):
-            row[WEIGHTS + 3 * output + axis] = law["weights"][output, axis, 0]
+            row[WEIGHTS + 3 * axis + output] = law["weights"][output, axis, 0]
     return demand

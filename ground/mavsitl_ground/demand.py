@@ -33,12 +33,22 @@ Send: TypeAlias = Callable[[Node, Target, int, Demand], None]
 
 def send_attitude(node: Node, target: Target, stamp_us: int, demand: Demand) -> None:
     """Attitude and thrust in SET_ATTITUDE_TARGET."""
-    node.send(SET_ATTITUDE_TARGET, stamp_us // 1000, *target, ATTITUDE_MASK, *demand)
+    _queue(node, target, stamp_us, ATTITUDE_MASK, demand)
 
 
 def send_rates(node: Node, target: Target, stamp_us: int, demand: Demand) -> None:
     """Body rates and thrust in SET_ATTITUDE_TARGET."""
-    node.send(SET_ATTITUDE_TARGET, stamp_us // 1000, *target, RATE_MASK, *demand)
+    _queue(node, target, stamp_us, RATE_MASK, demand)
+
+
+def _queue(node: Node, target: Target, stamp_us: int, mask: int, demand: Demand) -> None:
+    system_id, component_id = target
+    attitude, roll_rate, pitch_rate, yaw_rate, thrust = demand
+    frame = SET_ATTITUDE_TARGET(
+        node.sequence, node.system_id, node.component_id, stamp_us // 1000, system_id, component_id, mask,
+        attitude, roll_rate, pitch_rate, yaw_rate, thrust,
+    )  # fmt: skip
+    node.queue(frame)
 
 
 def send_torque(node: Node, target: Target, stamp_us: int, demand: Demand) -> None:

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from mavsitl.codec import Frame, reader
-from mavsitl.compiled import compiled, inlined
+from mavsitl.compiled import compiled, direct, inlined
 from mavsitl.control.arrays import Floats, Record, record
 from mavsitl.control.rotation import euler_rates, normalise, rotate, to_euler
 from mavsitl.dialect import mavlink
@@ -31,7 +31,7 @@ LINEAR = ("x", "y", "z", "vx", "vy", "vz")
 ANGULAR = ("rollspeed", "pitchspeed", "yawspeed")
 read_odometry = reader(
     mavlink.MAVLink_odometry_message,
-    "time_usec", "x", "y", "z", "q", "vx", "vy", "vz", *ANGULAR, "frame_id", "child_frame_id",
+    "time_usec", "x", "y", "z", "q", "vx", "vy", "vz", *ANGULAR, "frame_id", "child_frame_id", flat=True,
 )  # fmt: skip
 read_attitude = reader(mavlink.MAVLink_attitude_quaternion_message, "time_boot_ms", "q1", "q2", "q3", "q4", *ANGULAR)
 read_position = reader(mavlink.MAVLink_local_position_ned_message, "time_boot_ms", *LINEAR)
@@ -94,14 +94,15 @@ def take_linear(x: float, y: float, z: float, vx: float, vy: float, vz: float, n
 
 @compiled
 def take_odometry(
-    x: float, y: float, z: float, q: Quaternion, vx: float, vy: float, vz: float, p: float, q_rate: float, r: float,
-    in_body: bool, newer: bool, state: Record,
+    x: float, y: float, z: float, q_w: float, q_x: float, q_y: float, q_z: float,
+    vx: float, vy: float, vz: float, p: float, q_rate: float, r: float, in_body: bool, newer: bool, state: Record,
 ) -> bool:  # fmt: skip
     """Both; the velocity is FRD where it is `in_body`. One message is one state: half of a bad one is not taken."""
+    q = q_w, q_x, q_y, q_z
     good = _is_attitude(q, p, q_rate, r) and _is_linear(x, y, z, vx, vy, vz)
     if good and newer:
         if in_body:
-            vx, vy, vz = rotate(normalise(q[0], q[1], q[2], q[3]), (vx, vy, vz))
+            vx, vy, vz = rotate(normalise(q_w, q_x, q_y, q_z), (vx, vy, vz))
         _fill_attitude(q, p, q_rate, r, state)
         _fill_linear(x, y, z, vx, vy, vz, state)
     return good
@@ -140,7 +141,7 @@ class Observer:
         # Compiles, or reads the cache, before the clock runs; what is not newer changes nothing.
         still = (0.0, 0.0, 0.0)
         if source != "split":
-            take_odometry(*still, IDENTITY, *still, *still, False, False, self.state)
+            self._take_odometry = direct(take_odometry, *still, *IDENTITY, *still, *still, False, False, self.state)
         if source != "odometry":
             take_attitude(IDENTITY, *still, False, self.state)
             take_linear(*still, *still, False, self.state)
@@ -207,9 +208,6 @@ class Observer:
             return False
         return self.stamp_us - self._position_us <= (0 if self._pairs >= 2 else self._max_age_us)
 
-    def take(self) -> None:
-        self._fresh = False
-
     def age_us(self, now_us: int) -> int | None:
         """How old the newest state is at `now_us` of the ground's clock, beyond the fastest transport; None before any.
 
@@ -223,9 +221,13 @@ class Observer:
             self._offset_us = offset_us
         return offset_us - self._offset_us
 
-    def valid(self, now_us: int) -> bool:
-        age = self.age_us(now_us)
-        return age is not None and age <= self._max_age_us
+    def take(self, now_us: int) -> int | None:
+        """The age of a fresh state that is not too old, as of `age_us`: it is fresh no more. None: there is none."""
+        age_us = self.age_us(now_us) if self.fresh else None
+        if age_us is None or age_us > self._max_age_us:
+            return None
+        self._fresh = False
+        return age_us
 
     def receive(self, frame: Frame) -> None:
         """A frame of the vehicle; messages without one of the `handlers` are ignored."""
@@ -234,12 +236,13 @@ class Observer:
             handler(frame)
 
     def _on_odometry(self, frame: Frame) -> None:
-        stamp_us, x, y, z, q, vx, vy, vz, p, q_rate, r, frame_id, child = read_odometry(frame)
+        stamp_us, x, y, z, q_w, q_x, q_y, q_z, vx, vy, vz, p, q_rate, r, frame_id, child = read_odometry(frame)
         if frame_id != mavlink.MAV_FRAME_LOCAL_NED or child not in FRAMES:
             return
         newer = stamp_us >= self.stamp_us and stamp_us >= self._position_us
         in_body = child == mavlink.MAV_FRAME_BODY_FRD
-        if not take_odometry(x, y, z, q, vx, vy, vz, p, q_rate, r, in_body, newer, self.state):
+        take_odometry = self._take_odometry
+        if not take_odometry(x, y, z, q_w, q_x, q_y, q_z, vx, vy, vz, p, q_rate, r, in_body, newer, self.state):
             return
         if newer:
             self._attitude_at(stamp_us)

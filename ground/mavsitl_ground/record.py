@@ -5,16 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from mavsitl.control.arrays import Floats
-from mavsitl.frames import flip_euler
 from mavsitl.log import topics
-from mavsitl.log.block import Block, ned
+from mavsitl.log.block import Block, columns
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
 from mavsitl_ground import cycle, seat
-
-_DESIRED = slice(cycle.DESIRED, cycle.DESIRED + 3)
-_BY_NET = [cycle.WEIGHTS + k for k in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
-"""From (P, I, D) x (roll, pitch, yaw) to a net after another."""
 
 
 def block(recorder: Recorder, flight: Flight, *, with_weights: bool, own: bool = False) -> Block:
@@ -23,32 +18,27 @@ def block(recorder: Recorder, flight: Flight, *, with_weights: bool, own: bool =
     `own`: of a controller of the user's, which does not say U_2..U_4, and logs what it likes.
     """
     airframe = flight.airframe
-    # Angular acceleration to U_2, U_3 (forces) and U_4 (torque).
+    # Angular acceleration to U_2, U_3 (forces) and U_4 (torque), beside U_1 and W_1..W_3.
     per_u = np.array(airframe.inertia_kg_m2) / (airframe.arm_m, airframe.arm_m, 1.0)
+    scale = np.concatenate(([1.0], per_u, [1.0, 1.0, 1.0]))
 
-    def trajectory(v: Floats) -> Floats:
-        position, velocity = v[:, cycle.POSITION :][:, :3], v[:, cycle.VELOCITY :][:, :3]
-        return np.hstack((ned(position), ned(velocity), -v[:, cycle.YAW, np.newaxis]))
+    def control_demand(rows: Floats) -> Floats:
+        demand: Floats = rows[:, cycle.U1 : cycle.LINK] * scale
+        return demand
 
-    def control_demand(v: Floats) -> Floats:
-        acceleration, wind = v[:, cycle.ACCELERATION :][:, :3], v[:, cycle.WIND :][:, :3]
-        return np.hstack((v[:, cycle.U1, np.newaxis], acceleration * per_u, wind))
+    def attitude_setpoint(rows: Floats) -> Floats:
+        """phi_d, theta_d, psi_d in FRD, PX4's thrust_body, the same attitude FRD -> NED and a yaw rate, (k, 11)."""
+        (cx, cy, cz), (sx, sy, sz) = np.cos(half := 0.5 * rows[:, cycle.DESIRED :][:, :3].T), np.sin(half)
+        w, x = cx * cy * cz + sx * sy * sz, sx * cy * cz - cx * sy * sz
+        y, z = cx * sy * cz + sx * cy * sz, cx * cy * sz - sx * sy * cz
+        return np.column_stack((rows[:, cycle.DESIRED : cycle.U1], w, x, y, z, np.zeros(len(rows))))
 
-    columns = [
-        (topics.TRAJECTORY_SETPOINT, trajectory),
-        (topics.ATTITUDE_SETPOINT, _attitude_setpoint),
-        (topics.OWN_CONTROLLER, lambda v: v[:, seat.OWN :]) if own else (topics.CONTROL_DEMAND, control_demand),
-        (topics.LINK_STATUS, lambda v: v[:, cycle.LINK : cycle.LINK + 4]),
+    found = [
+        (topics.TRAJECTORY_SETPOINT, columns(cycle.POSITION, cycle.DESIRED)),
+        (topics.ATTITUDE_SETPOINT, attitude_setpoint),
+        (topics.OWN_CONTROLLER, columns(seat.OWN, seat.COLUMNS)) if own else (topics.CONTROL_DEMAND, control_demand),
+        (topics.LINK_STATUS, columns(cycle.LINK, cycle.WEIGHTS)),
     ]
     if with_weights:
-        columns.append((topics.PIDNN_WEIGHTS, lambda v: v[:, _BY_NET]))
-    return Block(recorder, seat.COLUMNS if own else cycle.COLUMNS, columns)
-
-
-def _attitude_setpoint(v: Floats) -> Floats:
-    """phi_d, theta_d, psi_d in FRD, PX4's thrust_body, and the same attitude FRD -> NED, (k, 11)."""
-    zero = np.zeros(len(v))
-    roll, pitch, yaw = flip_euler(*v[:, _DESIRED].T)
-    (a, b, c), (i, j, k) = np.cos([0.5 * roll, 0.5 * pitch, 0.5 * yaw]), np.sin([0.5 * roll, 0.5 * pitch, 0.5 * yaw])
-    quaternion = (a * b * c + i * j * k, i * b * c - a * j * k, a * j * c + i * b * k, a * b * k - i * j * c)
-    return np.column_stack((roll, pitch, yaw, zero, zero, -v[:, cycle.THRUST], *quaternion, zero))
+        found.append((topics.PIDNN_WEIGHTS, columns(cycle.WEIGHTS, cycle.COLUMNS)))
+    return Block(recorder, seat.COLUMNS if own else cycle.COLUMNS, found)

@@ -24,7 +24,7 @@ from mavsitl.controllers import (
     unit,
     vector,
 )
-from mavsitl.frames import Quaternion, Vector, flip_quaternion, flip_vector
+from mavsitl.frames import Quaternion, Vector, flip_euler, flip_quaternion, flip_vector
 from mavsitl.node import Node
 from mavsitl.quaternion import IDENTITY, to_euler
 from mavsitl.scenario import Flight
@@ -107,11 +107,12 @@ class Seat:
                 self._log(row)
             except Exception as error:
                 self._fail(error, f"update at {time_s:.3f} s")
-        row[cycle.POSITION : cycle.POSITION + 3] = reference.position
-        row[cycle.VELOCITY : cycle.VELOCITY + 3] = reference.velocity
-        row[cycle.YAW] = reference.yaw
-        row[cycle.DESIRED : cycle.DESIRED + 3] = to_euler(attitude)
-        row[cycle.THRUST] = thrust
+        position, velocity = reference.position.tolist(), reference.velocity.tolist()
+        row[cycle.POSITION : cycle.POSITION + 3] = flip_vector(*position)
+        row[cycle.VELOCITY : cycle.VELOCITY + 3] = flip_vector(*velocity)
+        row[cycle.YAW] = -reference.yaw
+        row[cycle.DESIRED : cycle.DESIRED + 3] = flip_euler(*to_euler(attitude))
+        row[cycle.THRUST_BODY : cycle.THRUST_BODY + 3] = 0.0, 0.0, -thrust
         row[cycle.U1] = thrust * self._max_thrust_n
         row[cycle.LINK : cycle.LINK + 4] = frames, lost, rejected, age_us
         return self._answered

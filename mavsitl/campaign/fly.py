@@ -16,7 +16,6 @@ from mavsitl.campaign.grid import Case, Labels, source_digest
 from mavsitl.campaign.sums import LOST_M, Six, Sums
 from mavsitl.clock import processor_s
 from mavsitl.drivers import Tap
-from mavsitl.log.tlog import WireHash
 from mavsitl.report.metrics import Rmse
 from mavsitl.report.run import scenario_digest
 from mavsitl.scenario import Flight
@@ -98,7 +97,13 @@ def fly(case: Case) -> Row:
     """Fly one case in this process. Whatever goes wrong in the flight is its row, not an exception."""
     started_s = processor_s()
     sums = Sums(case.flight)
-    wire = WireHash()
+
+    def watch(now_us: int) -> None:
+        sums.collect()
+        if sums.lost_s is not None:
+            raise _LostError
+
+    tap = Tap(record=watch)
 
     def row(status: Status, message: str = "") -> Row:
         return Row(
@@ -107,14 +112,9 @@ def fly(case: Case) -> Row:
             rmse=sums.rmse if status == "flown" else None, largest=sums.largest, weight_range=sums.weight_range,
             message=message, left_offboard=sums.left_offboard, effort_rad_s=sums.effort_rad_s,
             settling_s=sums.settling_s, labels=case.labels,
-            scenario_digest=scenario_digest(case.flight), wire_hash=wire.hexdigest(), code=source_digest(),
+            scenario_digest=scenario_digest(case.flight), wire_hash=tap.wire.hexdigest(), code=source_digest(),
             cpu_s=processor_s() - started_s,
         )  # fmt: skip
-
-    def watch(now_us: int) -> None:
-        sums.collect()
-        if sums.lost_s is not None:
-            raise _LostError
 
     said: list[str] = []
     with ExitStack() as stack:
@@ -129,7 +129,6 @@ def fly(case: Case) -> Row:
             if channels is not None:
                 ends.change_by_parameters(vehicle, channels)
             limit_s = flight.scenario.duration_s + GRACE_S
-            tap = Tap(wire=wire, record=watch)
             drivers.fly_in_memory(vehicle, ground, tap, max_time_s=limit_s, channels=channels)
             sums.collect()
         except _LostError:

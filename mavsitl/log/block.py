@@ -34,29 +34,28 @@ class Block:
     """`row` gives the next row to fill; the topics get theirs when the block is full or the recorder is flushed."""
 
     def __init__(self, recorder: Recorder, width: int, topics: Sequence[tuple[Topic, Split]]) -> None:
-        self._stamps = np.zeros(BLOCK_ROWS, dtype=np.uint64)
+        self._stamps: list[int] = []
         self._values = np.zeros((BLOCK_ROWS, width))
-        self._count = 0
         self._targets = _targets(recorder, topics)
         recorder.attach(self.drain)
 
     def row(self, timestamp_us: int) -> Array:
         """The next row, (width,), to be filled before the next call."""
-        if self._count == BLOCK_ROWS:
+        if len(self._stamps) == BLOCK_ROWS:
             self.drain()
-        index = self._count
-        self._stamps[index] = timestamp_us
-        self._count = index + 1
-        row: Array = self._values[index]
+        stamps = self._stamps
+        row: Array = self._values[len(stamps)]
+        stamps.append(timestamp_us)
         return row
 
     def drain(self) -> None:
         """Hand over what was gathered."""
-        count, self._count = self._count, 0
-        if count:
+        stamps, self._stamps = self._stamps, []
+        if stamps and self._targets:
+            times, values = np.array(stamps, dtype=np.uint64), self._values[: len(stamps)]
             with np.errstate(over="ignore"):
                 for rows, split in self._targets:
-                    rows.extend(self._stamps[:count], split(self._values[:count]))
+                    rows.extend(times, split(values))
 
 
 class Window:
@@ -112,6 +111,11 @@ class Window:
 
 def _targets(recorder: Recorder, topics: Sequence[tuple[Topic, Split]]) -> list[tuple[Rows, Split]]:
     return [(recorder.topic(topic), split) for topic, split in topics] if recorder.keeps else []
+
+
+def columns(first: int, end: int) -> Split:
+    """Of the rows gathered, as they are."""
+    return lambda rows: rows[:, first:end]
 
 
 def ned(vectors: Array) -> Array:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
 from enum import IntEnum
 from hashlib import blake2b
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
+from typing import TypeAlias
 
 from mavsitl.log.errors import Failed, LogError
 
@@ -16,7 +18,6 @@ _PREFIX = struct.Struct("<BI")
 _MAVLINK_1 = 0xFE
 _MAVLINK_2 = 0xFD
 _SIGNED = 0x01
-_HASH_CHUNK_BYTES = 16_384
 _BUFFER_BYTES = 65_536
 
 
@@ -25,6 +26,10 @@ class Direction(IntEnum):
 
     FROM_VEHICLE = 0
     FROM_GROUND = 1
+
+
+Heard: TypeAlias = tuple[Direction, int, bytes]
+"""Who sent a datagram, when, in microseconds, and the datagram."""
 
 
 def frames(datagram: bytes) -> list[bytes]:
@@ -67,19 +72,20 @@ class TlogWriter:
         except OSError as error:
             raise self._error(error) from error
 
-    def write(self, timestamp_us: int, datagram: bytes) -> None:
-        """Append the frames of one datagram, sent by either side at `timestamp_us`."""
-        waiting = self._waiting
-        if len(datagram) > 2 and datagram[0] == _MAVLINK_2 and not datagram[2] and len(datagram) == 12 + datagram[1]:
-            waiting += _STAMP.pack(timestamp_us)  # one frame, as nearly always
-            waiting += datagram
-        else:
-            taken = 0
+    def write(self, heard: Iterable[Heard]) -> None:
+        """Append the frames of datagrams, whoever sent them."""
+        waiting, stamp = self._waiting, _STAMP.pack
+        for _, now_us, datagram in heard:
+            size = len(datagram)
+            if size > 2 and datagram[1] + 12 == size and datagram[0] == _MAVLINK_2 and not datagram[2]:
+                waiting += stamp(now_us)  # one frame, as nearly always
+                waiting += datagram
+                continue
             for frame in frames(datagram):
-                waiting += _STAMP.pack(timestamp_us)
+                waiting += stamp(now_us)
                 waiting += frame
-                taken += len(frame)
-            self.left_out_bytes += len(datagram) - taken
+                size -= len(frame)
+            self.left_out_bytes += size
         if len(waiting) > _BUFFER_BYTES:
             self.flush()
 
@@ -134,22 +140,16 @@ class TlogWriter:
 class WireHash:
     """A running blake2b over (direction byte, uint32 length, datagram): runs that agree exchanged the same bytes."""
 
-    __slots__ = ("_hash", "_waiting")
-
     def __init__(self) -> None:
         self._hash = blake2b(digest_size=16)
-        self._waiting = bytearray()
 
-    def update(self, direction: Direction, datagram: bytes) -> None:
-        waiting = self._waiting
-        waiting += _PREFIX.pack(direction, len(datagram))
-        waiting += datagram
-        if len(waiting) > _HASH_CHUNK_BYTES:
-            self._hash.update(waiting)
-            waiting.clear()
+    def update(self, heard: Iterable[Heard]) -> None:
+        parts: list[bytes] = []
+        prefix = _PREFIX.pack
+        for direction, _, datagram in heard:
+            parts += (prefix(direction, len(datagram)), datagram)
+        self._hash.update(b"".join(parts))
 
     def hexdigest(self) -> str:
         """32 hexadecimal digits, of everything so far."""
-        self._hash.update(self._waiting)
-        self._waiting.clear()
         return self._hash.hexdigest()

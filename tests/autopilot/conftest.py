@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import chain
 from math import nan
 from typing import Any
 
@@ -231,7 +232,8 @@ class Client:
 def taken_of(message: Any) -> Setpoint | Refusal:
     """What a SET_ATTITUDE_TARGET asks for; `message` may have a `thrust_body`."""
     names = dict.fromkeys((*ATTITUDE_TARGET_FIELDS, "thrust_body"))
-    return from_attitude_target(*(getattr(message, name) for name in names if hasattr(message, name)))
+    values = [getattr(message, name) for name in names if hasattr(message, name)]
+    return from_attitude_target(*chain.from_iterable(v if isinstance(v, Sequence) else (v,) for v in values))
 
 
 def attitude_target(

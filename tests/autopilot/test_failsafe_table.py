@@ -23,6 +23,7 @@ from mavsitl_vehicle.autopilot.commander import (
 from mavsitl_vehicle.autopilot.modes import TABLE as MODES
 from mavsitl_vehicle.autopilot.modes import Control, Mode, Need
 from mavsitl_vehicle.autopilot.parameters import TABLE
+from msgspec.structs import asdict, replace
 
 from mavsitl.dialect import mavlink
 
@@ -113,7 +114,7 @@ class Flight:
         self.changes: Callable[[int], dict[str, Any]] = steady()
         self.row = ""
         """Whose warnings count; empty: everybody's."""
-        self.commander.step(0, WELL._replace(landed=True))
+        self.commander.step(0, replace(WELL, landed=True))
         assert self.commander.request_arm(True, False, 0) == ACCEPTED
         self.run(10.0)  # beyond what counts from the arming
         assert self.commander.request_mode(mode, "") == ACCEPTED
@@ -129,7 +130,7 @@ class Flight:
     def step(self) -> None:
         self.now_us += LOOK_US
         since_us = 0 if self.cause_us is None else self.now_us - self.cause_us
-        self.commander.step(self.now_us, WELL._replace(**self.changes(since_us)))
+        self.commander.step(self.now_us, replace(WELL, **self.changes(since_us)))
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds * SECOND_US / LOOK_US)):
@@ -664,7 +665,7 @@ def test_arming(mode: Mode, parameters: dict[str, float], changes: dict[str, Any
     values = {name: row.default for name, row in TABLE.items()} | parameters
     commander = Commander(values, lambda severity, text: said.append(text))
     commander.request_mode(mode, "")
-    commander.step(0, WELL._replace(landed=True, **changes))
+    commander.step(0, replace(WELL, landed=True, **changes))
     assert (commander.request_arm(True, False, 0) == ACCEPTED) == (refusal is None)
     assert said[-1] == ("Armed by external command" if refusal is None else f"Arming denied: {refusal}")
 
@@ -714,7 +715,7 @@ def test_whatever_happens(parameters: dict[str, float], events: list[Any]) -> No
     said: list[str] = []
     commander = Commander(values, lambda severity, text: said.append(text))
     commander.home_set = True
-    situation, now_us, terminated = WELL._replace(landed=True), 0, False
+    situation, now_us, terminated = replace(WELL, landed=True), 0, False
     for event in events:
         looks = 1
         match event:
@@ -758,7 +759,7 @@ def test_whatever_happens(parameters: dict[str, float], events: list[Any]) -> No
 def test_one_situation_only_ever_gets_worse(parameters: dict[str, float], situation: Situation, mode: Mode) -> None:
     """While nothing changes and nobody chooses, what is done about it never becomes less."""
     flight = Flight(mode, **parameters)
-    flight.changes = lambda since_us: situation._replace(landed=False)._asdict()
+    flight.changes = lambda since_us: asdict(replace(situation, landed=False))
     reached = Action.NONE
     for _ in range(700):
         flight.step()

@@ -6,10 +6,11 @@ import pytest
 from mavsitl_vehicle.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED, Commander, Situation
 from mavsitl_vehicle.autopilot.modes import Mode
 from mavsitl_vehicle.autopilot.parameters import TABLE
+from msgspec.structs import replace
 
 SECOND_US = 1_000_000
 WELL = Situation(landed=False, setpoint_age_us=0, sticks_age_us=0, gcs_age_us=0, mission_refusal=None)
-GCS_LOST = WELL._replace(gcs_age_us=None)
+GCS_LOST = replace(WELL, gcs_age_us=None)
 
 
 def flying(mode: Mode, said: list[str] | None = None, **parameters: float) -> Commander:
@@ -18,7 +19,7 @@ def flying(mode: Mode, said: list[str] | None = None, **parameters: float) -> Co
     values = {name: row.default for name, row in TABLE.items()} | parameters
     commander = Commander(values, lambda severity, text: texts.append(text))
     commander.home_set = True
-    commander.step(0, WELL._replace(landed=True))
+    commander.step(0, replace(WELL, landed=True))
     assert commander.request_arm(True, False, 0) == ACCEPTED
     commander.step(0, WELL)
     assert commander.request_mode(mode, "") == ACCEPTED
@@ -28,7 +29,7 @@ def flying(mode: Mode, said: list[str] | None = None, **parameters: float) -> Co
 
 
 @pytest.mark.parametrize(
-    "situation", [WELL._replace(battery_level=3), WELL._replace(fence_breach="far away"), GCS_LOST], ids=str
+    "situation", [replace(WELL, battery_level=3), replace(WELL, fence_breach="far away"), GCS_LOST], ids=str
 )
 def test_a_terminated_flight_stays_terminated(situation: Situation) -> None:
     said: list[str] = []
@@ -50,7 +51,7 @@ def test_a_terminated_flight_stays_terminated(situation: Situation) -> None:
 
 def test_a_termination_by_a_fail_safe_outlives_its_cause() -> None:
     commander = flying(Mode.POSCTL, GF_ACTION=4)
-    commander.step(SECOND_US, WELL._replace(fence_breach="far away"))
+    commander.step(SECOND_US, replace(WELL, fence_breach="far away"))
     assert commander.mode is Mode.TERMINATION
     commander.step(2 * SECOND_US, WELL)
     assert commander.mode is Mode.TERMINATION
@@ -62,9 +63,9 @@ def test_a_return_is_not_begun_in_a_landing_or_a_return(mode: Mode) -> None:
     said: list[str] = []
     commander = flying(mode, said, GF_ACTION=3, COM_LOW_BAT_ACT=3)
     for second in range(1, 10):
-        commander.step(second * SECOND_US, WELL._replace(fence_breach="far away", battery_level=2))
+        commander.step(second * SECOND_US, replace(WELL, fence_breach="far away", battery_level=2))
         assert commander.mode is mode
     assert "Warning: geofence breached" in said
-    commander.step(10 * SECOND_US, WELL._replace(battery_level=3))
-    commander.step(20 * SECOND_US, WELL._replace(battery_level=3))
+    commander.step(10 * SECOND_US, replace(WELL, battery_level=3))
+    commander.step(20 * SECOND_US, replace(WELL, battery_level=3))
     assert commander.mode is Mode.LAND  # which a low battery may still ask for

@@ -69,11 +69,10 @@ def test_a_key_is_in_no_log(tmp_path: Path) -> None:
     key = Key(bytes(range(32)))
     heartbeat = encode(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), 1, 255, 190)
     secret = encode(setup_signing((1, 1), key, 5), 0, 255, 190)
-    writer = TlogWriter(tmp_path / "link.tlog")
-    tap = Tap(tlog=writer)
+    tap = Tap(TlogWriter(tmp_path / "link.tlog"))
     for datagram in (secret, heartbeat, secret + heartbeat):
         tap.hear(Direction.FROM_GROUND, 4000, datagram)
-    writer.close()
+    tap.close()
     written = (tmp_path / "link.tlog").read_bytes()
     assert bytes(range(32)) not in written
     assert written.count(heartbeat) == 2

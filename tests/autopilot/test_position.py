@@ -24,6 +24,7 @@ from mavsitl_vehicle.autopilot.setpoints import (
     State,
 )
 from mavsitl_vehicle.autopilot.trajectory import Trajectory, landing_speed, takeoff_climb_limit
+from msgspec.structs import astuple
 
 from mavsitl.frames import Quaternion, Vector
 from mavsitl.quaternion import conjugate, from_euler, multiply, to_euler, up_vector
@@ -69,7 +70,7 @@ def test_any_input_gives_a_setpoint_within_the_limits(ticks: list[tuple[Position
     control = cascade(MPC_XY_VEL_D_ACC=0.2, MPC_Z_VEL_D_ACC=0.1)
     control.engage(AttitudeSetpoint(from_euler(0.3, -0.2, 2.0), 0.0, 0.6))
     for setpoint, state in [*ticks, (PositionSetpoint(ORIGIN), AT_REST)]:
-        attitude, yaw_rate, thrust = control.update(setpoint, state)
+        attitude, yaw_rate, thrust = astuple(control.update(setpoint, state))
         assert all(isfinite(value) for value in (*attitude, yaw_rate, thrust))
         assert hypot(*attitude) == pytest.approx(1.0, abs=1e-9)
         assert VALUES["MPC_THR_MIN"] - 1e-9 <= thrust <= VALUES["MPC_THR_MAX"]
@@ -114,7 +115,7 @@ def test_thrust_attitude_points_the_thrust_and_keeps_the_heading(up: Vector, yaw
 
 
 def test_at_rest_on_its_place_it_hovers() -> None:
-    attitude, yaw_rate, thrust = cascade().update(PositionSetpoint(ORIGIN), AT_REST)
+    attitude, yaw_rate, thrust = astuple(cascade().update(PositionSetpoint(ORIGIN), AT_REST))
     assert attitude == LEVEL
     assert yaw_rate == 0.0
     assert thrust == pytest.approx(HOVER)

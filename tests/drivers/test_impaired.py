@@ -167,9 +167,9 @@ def test_the_vehicle_says_hello_until_it_is_answered_and_then_takes_turns() -> N
     assert vehicle.received == [b"0", b"8000"]
     expected = WireHash()
     for stamp, answer in ((b"0", b"0"), (b"4000", b""), (b"8000", b"8000"), (b"12000", b"")):
-        expected.update(Direction.FROM_VEHICLE, stamp)
+        expected.update([(Direction.FROM_VEHICLE, 0, stamp)])
         if answer:
-            expected.update(Direction.FROM_GROUND, answer)
+            expected.update([(Direction.FROM_GROUND, 0, answer)])
     assert tap.wire.hexdigest() == expected.hexdigest()
 
 

@@ -194,9 +194,9 @@ def test_the_first_datagram_is_repeated_until_it_is_answered_and_heard_once() ->
     assert link.sent == [b"0", b"0", b"0", b"4000", b"8000", b"12000", b"16000"]
     expected = WireHash()
     for stamp in (b"0", b"4000", b"8000", b"12000"):
-        expected.update(Direction.FROM_VEHICLE, stamp)
-        expected.update(Direction.FROM_GROUND, stamp)
-    expected.update(Direction.FROM_VEHICLE, b"16000")
+        expected.update([(Direction.FROM_VEHICLE, 0, stamp)])
+        expected.update([(Direction.FROM_GROUND, 0, stamp)])
+    expected.update([(Direction.FROM_VEHICLE, 0, b"16000")])
     assert tap.wire.hexdigest() == expected.hexdigest()
 
 
@@ -206,8 +206,8 @@ def test_repeats_of_the_first_datagram_are_dropped() -> None:
     assert core.received == link.sent == [b"0", b"4000", b"8000", b"12000", b"16000"]
     expected = WireHash()
     for stamp in core.received:
-        expected.update(Direction.FROM_VEHICLE, stamp)
-        expected.update(Direction.FROM_GROUND, stamp)
+        expected.update([(Direction.FROM_VEHICLE, 0, stamp)])
+        expected.update([(Direction.FROM_GROUND, 0, stamp)])
     assert tap.wire.hexdigest() == expected.hexdigest()
 
 

@@ -30,7 +30,7 @@ def test_a_tlog_cut_anywhere_is_read_up_to_the_cut(tmp_path: Path) -> None:
     path, cut = tmp_path / "a.tlog", tmp_path / "cut.tlog"
     with TlogWriter(path) as tlog:
         for k in range(3):
-            tlog.write(1_700_000_000_000_000 + k, heartbeat(1 + k))
+            tlog.write([(Direction.FROM_VEHICLE, 1_700_000_000_000_000 + k, heartbeat(1 + k))])
     data = path.read_bytes()
     size = len(data) // 3
     for length in range(size, len(data) + 1):

@@ -55,8 +55,7 @@ def telemetry(rng: np.random.Generator) -> Iterator[tuple[int, Any]]:
     for k in range(CALLS):
         q = rng.normal(size=4) * (1.0, 0.2, 0.2, 0.2)
         values = np.concatenate((rng.normal(size=3), q / np.sqrt(q @ q), rng.normal(size=6))).astype(np.float32)
-        x, y, z, q_w, q_x, q_y, q_z, *rest = values.astype(np.float64).tolist()
-        yield k * PERIOD_US, (x, y, z, (q_w, q_x, q_y, q_z), *rest)
+        yield k * PERIOD_US, tuple(values.astype(np.float64).tolist())
 
 
 def take(values: Any, in_body: bool, into: Observer) -> bool:
@@ -100,12 +99,11 @@ def digests() -> dict[str, str]:
             add(name, *path.sample(time_s))
     seen = Observer()
     for _, values in telemetry(rng):
-        x, y, z, q, vx, vy, vz, *rates = values
+        x, y, z, *q, vx, vy, vz, w_x, w_y, w_z = values
         for in_body in (False, True):
             good = take(values, in_body, seen)
             add("odometry", good, *(seen.state[name] for name in ("position", "velocity", "quaternion", "angle_rates")))
-        w_x, w_y, w_z = rates
-        good = observer.take_attitude(q, w_x, w_y, w_z, True, seen.state)
+        good = observer.take_attitude(tuple(q), w_x, w_y, w_z, True, seen.state)
         good = good and observer.take_linear(x, y, z, vx, vy, vz, True, seen.state)
         add("split", good, *(seen.state[name] for name in ("position", "velocity", "quaternion", "angles", "omega")))
         add("norm", rotation.norm(*q))

@@ -103,7 +103,8 @@ class ByHand:
             wanted = self.inner.update(state.angles_rad, state.angle_rates_rad_s, desired, rates)
             out = self.inner.torque_shares(wanted) if level == "torque" else self._rates(wanted, state)
             demand = [1.0, 0.0, 0.0, 0.0, *flip_vector(*out[:, 0].tolist()), share]
-        row = [*position, *velocity, yaw, *desired[:, 0], share, self.thrust_n, *wanted[:, 0], *wind[:, 0]]
+        wire = [flip_vector(*vector) for vector in (position, velocity, desired[:, 0].tolist())]
+        row = [*wire[0], *wire[1], -yaw, *wire[2], 0.0, 0.0, -share, self.thrust_n, *wanted[:, 0], *wind[:, 0]]
         return demand, row
 
     def _rates(self, wanted: Floats, state: Observer) -> Floats:
@@ -130,7 +131,7 @@ def test_it_is_its_laws_in_their_order(variant: str) -> None:
         weights = by_hand.inner.weights
         if controller.learns:
             assert weights is not None
-            assert row[cycle.WEIGHTS :].tolist() == weights.reshape(9).tolist()
+            assert row[cycle.WEIGHTS :].tolist() == weights[:, :, 0].T.ravel().tolist()
 
 
 def test_after_a_reset_it_is_as_new() -> None:

@@ -117,7 +117,7 @@ BAD: dict[str, dict[str, Any]] = {
 def test_nothing_of_a_bad_message_is_taken(bad: dict[str, Any], child: int) -> None:
     observer = Observer()
     observer.receive(odometry(4000))
-    observer.take()
+    observer.take(observer.stamp_us)
     before = state(observer)
     observer.receive(odometry(8000, child=child, **({"x": 9.0, "vx": 9.0, "rollspeed": 9.0} | bad)))
     assert state(observer) == before
@@ -143,7 +143,7 @@ def test_split_messages_that_are_not_finite_are_ignored(field: int) -> None:
 def test_a_late_message_does_not_overwrite_a_newer_one() -> None:
     observer = Observer()
     observer.receive(odometry(900_000))
-    observer.take()
+    observer.take(observer.stamp_us)
     before = state(observer)
     observer.receive(odometry(896_000, x=50.0, vx=50.0, rollspeed=1.0))
     assert state(observer) == before
@@ -153,7 +153,7 @@ def test_a_late_message_does_not_overwrite_a_newer_one() -> None:
 def test_the_same_stamp_again_is_not_fresh() -> None:
     observer = Observer()
     observer.receive(odometry(4000))
-    observer.take()
+    observer.take(observer.stamp_us)
     observer.receive(odometry(4000))
     assert not observer.fresh
 
@@ -179,7 +179,7 @@ def test_an_attitude_without_a_position_near_it_is_not_fresh() -> None:
     observer.receive(position(100_000))
     observer.receive(attitude(600_000))
     assert observer.fresh
-    observer.take()
+    observer.take(observer.stamp_us)
     observer.receive(attitude(601_000))
     assert not observer.fresh
 
@@ -190,7 +190,7 @@ def test_an_attitude_waits_for_its_position_where_every_one_had_one() -> None:
         observer.receive(attitude(stamp_us))
         observer.receive(position(stamp_us))
         assert observer.fresh
-        observer.take()
+        observer.take(observer.stamp_us)
     observer.receive(attitude(16_000))
     assert not observer.fresh
     observer.receive(position(16_000))
@@ -202,7 +202,7 @@ def test_a_lost_position_delays_the_attitude_by_one_at_most() -> None:
     for stamp_us in (4000, 8000, 12_000):
         observer.receive(attitude(stamp_us))
         observer.receive(position(stamp_us))
-    observer.take()
+    observer.take(observer.stamp_us)
     observer.receive(attitude(16_000))
     observer.receive(attitude(20_000))
     assert observer.fresh
@@ -213,7 +213,7 @@ def test_positions_that_come_more_rarely_are_not_waited_for() -> None:
     for stamp_us in range(20_000, 400_000, 20_000):
         observer.receive(attitude(stamp_us))
         assert observer.fresh or stamp_us < 40_000
-        observer.take()
+        observer.take(observer.stamp_us)
         if stamp_us % 40_000 == 20_000:
             observer.receive(position(stamp_us))
 
@@ -221,14 +221,15 @@ def test_positions_that_come_more_rarely_are_not_waited_for() -> None:
 def test_age_and_validity_are_by_the_ground_s_clock() -> None:
     observer = Observer(max_age_us=500_000)
     assert observer.age_us(7_000_000) is None
-    assert not observer.valid(7_000_000)
+    assert observer.take(7_000_000) is None
     observer.receive(odometry(4000))
     assert observer.age_us(7_000_000) == 0  # the fastest way seen so far
     assert observer.age_us(7_500_000) == 500_000
-    assert observer.valid(7_500_000)
-    assert not observer.valid(7_500_001)
+    assert observer.take(7_500_001) is None
+    assert observer.take(7_500_000) == 500_000
+    assert observer.take(7_500_000) is None  # once
     observer.receive(odometry(504_000))
-    assert observer.age_us(7_500_300) == 300
+    assert observer.take(7_500_300) == 300
     observer.reset()
     assert observer.age_us(7_500_000) is None
 

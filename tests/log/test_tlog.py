@@ -37,9 +37,10 @@ def test_pymavlink_reads_every_frame_with_its_time(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     with TlogWriter(path) as tlog:
         for k in range(5):
-            tlog.write(T0 + 4000 * k, heartbeat(1) + heartbeat(1, version=1))
-            tlog.write(T0 + 4000 * k, heartbeat(255))
-        tlog.write(T0, b"rubbish")
+            up = Direction.FROM_VEHICLE, T0 + 4000 * k, heartbeat(1) + heartbeat(1, version=1)
+            down = Direction.FROM_GROUND, T0 + 4000 * k, heartbeat(255)
+            tlog.write([up, down])
+        tlog.write([(Direction.FROM_GROUND, T0, b"rubbish")])
         assert tlog.left_out_bytes == 7
     reader = mavutil.mavlogfile(str(path))
     seen = []
@@ -54,7 +55,7 @@ def test_faults_name_the_file(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"none/a\.tlog: cannot be written"):
         TlogWriter(tmp_path / "none" / "a.tlog")
     tlog = TlogWriter(Path("/dev/full"))
-    tlog.write(0, heartbeat(1))
+    tlog.write([(Direction.FROM_VEHICLE, 0, heartbeat(1))])
     with pytest.raises(LogError, match="/dev/full: cannot be written: No space left"):
         tlog.flush()
     with pytest.raises(LogError, match="/dev/full: cannot be written: it is closed"):
@@ -65,8 +66,7 @@ def test_faults_name_the_file(tmp_path: Path) -> None:
 def test_the_wire_hash_tells_direction_order_and_where_datagrams_end() -> None:
     def of(*parts: tuple[Direction, bytes]) -> str:
         wire = WireHash()
-        for direction, datagram in parts:
-            wire.update(direction, datagram)
+        wire.update((direction, 0, datagram) for direction, datagram in parts)
         return wire.hexdigest()
 
     up, down = Direction.FROM_VEHICLE, Direction.FROM_GROUND

@@ -38,6 +38,10 @@ def check(message_class: MessageClass, wire: bytes, order: list[str]) -> None:
     frame = frame_of(wire)
     expected = {name: plain(frame.message, name) for name in message_class.fieldnames}
     assert repr(reader(message_class, *order)(frame)) == repr(tuple(expected[name] for name in order))
+    flat: list[Any] = []
+    for name in order:
+        flat += expected[name] if isinstance(expected[name], tuple) else (expected[name],)
+    assert repr(reader(message_class, *order, flat=True)(frame)) == repr(tuple(flat))
     for name, value in expected.items():
         assert repr(reader(message_class, name)(frame_of(wire))) == repr((value,))
 

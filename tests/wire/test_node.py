@@ -51,7 +51,7 @@ def test_combined_datagrams_keep_order_and_size(max_bytes: int) -> None:
         single.send_message(HEARTBEAT)
         node.send(pack_ping, number + 1, 2, 3, 4)
         single.send(pack_ping, number + 1, 2, 3, 4)
-    datagrams = node.datagrams(max_bytes, combine=True)
+    datagrams = node.datagrams(combine=True, max_bytes=max_bytes)
     frames = single.datagrams()
     assert b"".join(datagrams) == b"".join(frames)
     longest = max(len(frame) for frame in frames)

@@ -13,7 +13,7 @@ from mavsitl.dialect import mavlink
 from mavsitl.frames import flip_vector
 from mavsitl.geodesy import Origin
 from mavsitl.log import topics
-from mavsitl.log.block import Array, Block, Group, Split, Window, ned
+from mavsitl.log.block import Array, Block, Group, Window, columns, ned
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
 from mavsitl.services.command import Command
@@ -49,10 +49,6 @@ def _to_wire(largest_rad_s: float) -> Array:
     signs[[tick.LOG_THRUST, tick.LOG_YAW_RATE]] = -1.0
     signs[tick.LOG_COMMANDED : tick.LOG_COMMANDED + 4] = 1.0 / largest_rad_s
     return signs
-
-
-def _columns(begin: int, end: int) -> Split:
-    return lambda v: v[:, begin:end]
 
 
 def _flown(*kinds: float) -> Callable[[Array], NDArray[np.bool_]]:
@@ -116,22 +112,22 @@ class Record:
         return (
             Group(
                 (
-                    (topics.LOCAL_POSITION_TRUTH, _columns(0, 6)),
-                    (topics.ATTITUDE_TRUTH, _columns(6, 10)),
-                    (topics.ANGULAR_VELOCITY_TRUTH, _columns(10, 13)),
+                    (topics.LOCAL_POSITION_TRUTH, columns(0, 6)),
+                    (topics.ATTITUDE_TRUTH, columns(6, 10)),
+                    (topics.ANGULAR_VELOCITY_TRUTH, columns(10, 13)),
                     (topics.LOCAL_POSITION, self._local_position),
-                    (topics.ATTITUDE, _columns(23, 27)),
-                    (topics.ANGULAR_VELOCITY, _columns(27, 30)),
-                    (topics.WIND_TRUTH, _columns(tick.LOG_WIND, tick.LOG_WIND + 3)),
-                    (topics.ACTUATOR_MOTORS, _columns(tick.LOG_COMMANDED, tick.LOG_COMMANDED + 4)),
+                    (topics.ATTITUDE, columns(23, 27)),
+                    (topics.ANGULAR_VELOCITY, columns(27, 30)),
+                    (topics.WIND_TRUTH, columns(tick.LOG_WIND, tick.LOG_WIND + 3)),
+                    (topics.ACTUATOR_MOTORS, columns(tick.LOG_COMMANDED, tick.LOG_COMMANDED + 4)),
                     (topics.ROTOR_STATUS, lambda v: np.column_stack((v[:, 13:17], v[:, tick.LOG_SATURATED]))),
                 )
             ),
             Group(((topics.ATTITUDE_SETPOINT, _attitude_setpoint),), _ATTITUDE_FLOWN),
             Group(((topics.RATES_SETPOINT, lambda v: np.hstack((v[:, rates : rates + 3], _thrust(v)))),), _RATES_FLOWN),
-            Group(((topics.RATE_STATUS, _columns(integral, integral + 3)),), _RATES_FLOWN, INTEGRAL_US),
+            Group(((topics.RATE_STATUS, columns(integral, integral + 3)),), _RATES_FLOWN, INTEGRAL_US),
             Group(
-                ((topics.TORQUE_SETPOINT, _columns(torque, torque + 3)), (topics.THRUST_SETPOINT, _thrust)),
+                ((topics.TORQUE_SETPOINT, columns(torque, torque + 3)), (topics.THRUST_SETPOINT, _thrust)),
                 _TURNING,
                 TORQUE_US,
             ),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from math import nan, radians
+from math import radians
 
 import msgspec
 import numpy as np
 
 from mavsitl import seeds
+from mavsitl.compiled import direct
 from mavsitl.frames import Vector
 from mavsitl.log.block import BLOCK_ROWS
 from mavsitl.quaternion import conjugate, rotate, to_euler
@@ -33,10 +34,11 @@ TURBULENCE_HEIGHT_M = 6.096
 BLOCK_TICKS = 250
 """Normals are drawn for this many ticks at once."""
 
-_PACK_DEMAND = struct.Struct(f"={tick.DEMAND_ROWS}d").pack_into
+# Rows of `asked` from KIND to the last that a kind of demand has; between them are zeros.
+_PACK_ATTITUDE = struct.Struct("=d 4d 24x 24x d d").pack_into
+_PACK_RATE = struct.Struct("=d 32x 3d 24x d").pack_into
+_PACK_TORQUE = struct.Struct("=d 32x 24x 3d d").pack_into
 _DEMAND_BYTES = 8 * tick.DEMAND_ROWS
-_NOTHING = (0.0, 0.0, 0.0)
-_LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 WARM_UP_US = 1_000_000
 """In so much time at rest a filter uses everything that it has."""
@@ -100,7 +102,8 @@ class Simulation:
         self.gains = rows[tick.GAINS_AT : tick.SIGMA_AT]
         self.sigma = rows[tick.SIGMA_AT : tick.PLANT_AT]
         self.plant = rows[tick.PLANT_AT :]
-        self.estimates: list[list[float]] = self.estimate.T.tolist()
+        self._by_vehicle = self.estimate.T
+        self.estimates: list[list[float]] = self._by_vehicle.tolist()
         self._asked = np.zeros((n, tick.DEMAND_ROWS))
         self._asked_bytes = self._asked.data.cast("B")
         self.demand = self._asked.T
@@ -155,19 +158,18 @@ class Simulation:
 
     def set_demand(self, j: int, setpoint: Setpoint | None) -> None:
         """What vehicle `j`'s inner loops follow during the next tick; None stops its rotors."""
-        if isinstance(setpoint, AttitudeSetpoint):
-            kind, attitude, rate, torque = tick.ATTITUDE_KIND, setpoint.attitude, _NOTHING, _NOTHING
-            yaw_rate = setpoint.yaw_rate_rad_s
+        asked, at = self._asked_bytes, j * _DEMAND_BYTES
+        if isinstance(setpoint, RateSetpoint):
+            p, q, r = setpoint.omega_flu_rad_s
+            _PACK_RATE(asked, at, tick.RATE_KIND, p, q, r, setpoint.thrust)
+        elif isinstance(setpoint, AttitudeSetpoint):
+            w, x, y, z = setpoint.attitude
+            _PACK_ATTITUDE(asked, at, tick.ATTITUDE_KIND, w, x, y, z, setpoint.thrust, setpoint.yaw_rate_rad_s)
         elif setpoint is None:
             self.demand[tick.KIND, j] = tick.STOPPED
-            return
-        elif isinstance(setpoint, RateSetpoint):
-            kind, attitude, rate, torque = tick.RATE_KIND, _LEVEL, setpoint.omega_flu_rad_s, _NOTHING
-            yaw_rate = nan
         else:
-            kind, attitude, rate, torque = tick.TORQUE_KIND, _LEVEL, _NOTHING, setpoint.torque
-            yaw_rate = nan
-        _PACK_DEMAND(self._asked_bytes, j * _DEMAND_BYTES, kind, *attitude, *rate, *torque, setpoint.thrust, yaw_rate)
+            roll, pitch, yaw = setpoint.torque
+            _PACK_TORQUE(asked, at, tick.TORQUE_KIND, roll, pitch, yaw, setpoint.thrust)
 
     @property
     def estimator_status(self) -> EstimatorStatus:
@@ -292,20 +294,22 @@ class Simulation:
                 self._wind_normals.go_on(row)
             if row in self._sensor_normals.due:
                 self._sensor_normals.go_on(row)
-        self._flight_time_s[:] = flight_time_s
+        field = self.field
+        if field.gusty:
+            self._flight_time_s[:] = flight_time_s
         for j, motors in enumerate(self.motors):
             if motors.busy:
                 motors.step(number * self.substeps * self.dt_s, self.x[13:17, j])
         self._tick = number + 1
-        field = self.field
         if self.sensed is not None:
             self._advance_sensed(self.sensed, number)
             return
-        tick.advance(
+        advance = self._advance
+        advance(
             self._rows, self._asked, self.held, field.state, field.coefficients, self._wind_normals.block,
             self._sensor_normals.block, self._log, self._block, number, self.dt_s, self.substeps,
         )  # fmt: skip
-        self.estimates = self.estimate.T.tolist()
+        self.estimates = self._by_vehicle.tolist()
 
     def logged(self, j: int, count: int) -> tick.Array:
         """(count, tick.LOG_WIDTH) of vehicle `j`: now, and the ticks before it, the oldest first."""
@@ -359,12 +363,11 @@ class Simulation:
         if self.sensed is not None:
             self._warm_up_sensed(rows, asked)
             return
-        for kind in (tick.STOPPED, tick.ATTITUDE_KIND):
-            asked[:, tick.KIND] = kind
-            tick.advance(
-                rows, asked, self.held, self.field.state.copy(), self.field.coefficients, self._wind_normals.block,
-                self._sensor_normals.block, self._log.copy(), self._block, 0, self.dt_s, self.substeps,
-            )  # fmt: skip
+        self._advance = direct(
+            tick.advance,
+            rows, asked, self.held, self.field.state.copy(), self.field.coefficients, self._wind_normals.block,
+            self._sensor_normals.block, self._log.copy(), self._block, 0, self.dt_s, self.substeps,
+        )  # fmt: skip
 
     def _warm_up_sensed(self, rows: tick.Array, asked: tick.Array) -> None:
         sensed, field = self._make_sensed(0, Failures(), range(self.n)), self.field

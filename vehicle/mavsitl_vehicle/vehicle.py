@@ -132,14 +132,15 @@ class Vehicle:
         self._now_us = -self.period_us
         self._held: bool | None = None
         self._at_rest: bool | None = None
-        """What the simulation was told last; None: nothing."""
+        """What the simulation was told last; None: nothing. At rest is in the clamp, or disarmed on the ground."""
         self._running = True
         """The autopilot does, in this control period."""
         self._boot_us = 0
         """The driver's time at which the autopilot booted last."""
         self._clock_us = 0
         """The autopilot's clock at the last step."""
-        self._done = False
+        self.finished = False
+        """It has flown and is disarmed again."""
         self._recorder = recorder
         self._seed = seed
         self._chaos: Chaos | None = None
@@ -246,14 +247,9 @@ class Vehicle:
         return None if self._seated is None else self._seated.weights
 
     @property
-    def finished(self) -> bool:
-        """It has flown and is disarmed again."""
-        return self._done
-
-    @property
     def succeeded(self) -> bool:
         """As `finished`: for a vehicle every landing is one."""
-        return self._done
+        return self.finished
 
     @property
     def flight_time_s(self) -> float:
@@ -322,7 +318,8 @@ class Vehicle:
             return -1.0
         land = autopilot.land
         if running:
-            held, at_rest = land.held, autopilot.at_rest
+            held = land.held
+            at_rest = held or (land.on_ground and not autopilot.commander.armed)
             if held is not self._held or at_rest is not self._at_rest:
                 simulation.held[j], simulation.at_rest[j] = self._held, self._at_rest = held, at_rest
             setpoint = autopilot.decide(now_us - self.period_us)
@@ -350,7 +347,7 @@ class Vehicle:
         if self._signing is not None:
             self._signing.policy.locked = autopilot.commander.armed
         if autopilot.land.released_us is not None and not autopilot.commander.armed:
-            self._done = True
+            self.finished = True
             self._after_flight()
 
     def note_failure(self, change: Change) -> None:
@@ -405,7 +402,7 @@ class Vehicle:
 
     def datagrams(self, port: int, *, combine: bool) -> list[bytes]:
         """What goes out on a link: one message a datagram, or all of a tick in one (`combine`)."""
-        return self.autopilot.ports[port].node.datagrams(combine=combine)
+        return self.autopilot.ports[port].node.datagrams(combine)
 
     def _inner_law(self, law: SeatedLaw, setpoint: Setpoint | None) -> Setpoint | None:
         """With the PIDNN aboard, an off-board attitude becomes a torque by it; all else passes."""

@@ -67,7 +67,7 @@ SLOW_BATTERY_US = 20_000_000
 _ALL_VALID = Validity()
 
 _read_attitude_target = reader(
-    mavlink.MAVLink_set_attitude_target_message, "time_boot_ms", *setpoints.ATTITUDE_TARGET_FIELDS
+    mavlink.MAVLink_set_attitude_target_message, "time_boot_ms", *setpoints.ATTITUDE_TARGET_FIELDS, flat=True
 )
 
 
@@ -171,6 +171,8 @@ class Autopilot:
         self.wind: telemetry.Wind | None = None
         """As estimated; None: not known."""
         self.health = Health()
+        self._healthy = self.health
+        """The same, whatever the mode says; and why that does not allow arming."""
         self._health_refusal: str | None = None
         self.attitude_setpoint: Setpoint | None = None
         """What the inner loops follow."""
@@ -206,6 +208,8 @@ class Autopilot:
         self._altitude_loss = AltitudeLoss()
         self.shown: Shown | None = None
         """What `report` said last: the same object until that changes."""
+        self._reported: tuple[object, ...] = ()
+        """What it was made of."""
         self._gcs_us: int | None = None
         self._links_failed = False
         self._look_us = 0
@@ -367,11 +371,6 @@ class Autopilot:
             status.velocity_valid and status.evh_m_s <= velocity_m_s,
             status.position_valid and (position_m < 0.0 or status.eph_m <= position_m),
         )
-
-    @property
-    def at_rest(self) -> bool:
-        """It does not move, and knows it: in the clamp, or disarmed on the ground."""
-        return self.land.held or (self.land.on_ground and not self.commander.armed)
 
     # --- what commands need ------------------------------------------------------------------------------------------
 
@@ -780,7 +779,7 @@ class Autopilot:
         x, y, z = self.estimate[:3]
         self._fence_breach = self._plan_watch.breach((x, y, z))
         needs, valid, sensors = modes.TABLE[self.commander.intended].needs, self.valid, self._status.sensors
-        self.health = Health(
+        health = Health(
             gyro=sensors.gyro,
             accelerometer=sensors.accelerometer,
             magnetometer=sensors.magnetometer,
@@ -798,8 +797,11 @@ class Autopilot:
             fence_breached=self._fence_breach is not None and self._plan_watch.acts,
             position_needed=Need.POSITION in needs,
         )
-        self._health_refusal = summary(self.health)
-        self.health = self.health._replace(mode_refusal=self.commander.mode_refusal())
+        if health != self._healthy:
+            self._healthy = health
+            self._health_refusal = summary(health)
+        mode_refusal = self.commander.mode_refusal()
+        self.health = health if mode_refusal is None else health._replace(mode_refusal=mode_refusal)
 
     def _watch_plan(self, now_us: int) -> None:
         """What fail-safes must not wait for until the house is kept."""
@@ -829,9 +831,9 @@ class Autopilot:
             now_us,
             self.estimate,
             0.0 if setpoint is None else setpoint.thrust,
-            armed=commander.armed,
-            ready=land.on_ground and commander.spooled_up(now_us),
-            landing=self.navigator.landing,
+            commander.armed,
+            land.on_ground and commander.spooled_up(now_us),
+            self.navigator.landing,
         )
         if took_off:
             self.flight_times = self.flight_times._replace(took_off_us=max(now_us, 1))
@@ -869,15 +871,17 @@ class Autopilot:
 
     def _changed(self) -> bool:
         """Whether what is told at once is another than in the last report."""
-        before, commander = self.shown, self.commander
-        mode, armed, failsafe, landed_state = commander.mode, commander.armed, commander.failsafe, self.landed_state
-        if before is None:
-            self.shown = Shown(mode, armed, failsafe, landed_state)
+        commander = self.commander
+        mode, armed, failsafe = commander.mode, commander.armed, commander.failsafe
+        state = mode, armed, failsafe, self.land.state, self.navigator.landing
+        if state == self._reported:
             return False
-        if before == (mode, armed, failsafe, landed_state):
+        self._reported = state
+        before, shown = self.shown, Shown(mode, armed, failsafe, self.landed_state)
+        if shown == before:
             return False
-        self.shown = Shown(mode, armed, failsafe, landed_state)
-        return True
+        self.shown = shown
+        return before is not None
 
     def _fail_links(self) -> None:
         """What counts on each link until the next period: an answer to the command that breaks it still goes."""

@@ -14,6 +14,8 @@ from math import inf, radians
 from operator import attrgetter
 from typing import NamedTuple
 
+from msgspec import Struct
+
 from mavsitl.dialect import mavlink
 from mavsitl_vehicle.autopilot import modes
 from mavsitl_vehicle.autopilot.modes import Control, Mode, Need
@@ -102,7 +104,7 @@ EXCEPTION_BITS = {
 """Of COM_RCL_EXCEPT and COM_DLL_EXCEPT, by the mode that the user chose."""
 
 
-class Situation(NamedTuple):
+class Situation(Struct, frozen=True):
     """What the commander looks at, once a step. Ages are microseconds since the last good one; None: there was none."""
 
     landed: bool
@@ -247,16 +249,12 @@ class Commander:
         self._since_us: dict[str, int] = {}
         """Name of a row with `after` to the time when its cause began."""
         self._overridden: set[str] = set()
-        self._acting = False
+        self.failsafe = False
+        """A fail-safe, not the user, has set the mode, be it the one that the user had chosen."""
         self._worst = Action.NONE
         self._delay = HoldDelay()
         self._delaying = False
         self._watched_us = 0
-
-    @property
-    def failsafe(self) -> bool:
-        """A fail-safe, not the user, has set the mode, be it the one that the user had chosen."""
-        return self._acting
 
     @property
     def overruled(self) -> bool:
@@ -308,7 +306,7 @@ class Commander:
         allowed = bit & int(self.parameters["COM_RC_OVERRIDE"])
         if not allowed or not self.armed or self.situation.landed or self.kill_engaged:
             return False
-        if self._acting and self.mode is Mode.LOITER and (self._delaying or not self._sticks_end_hold()):
+        if self.failsafe and self.mode is Mode.LOITER and (self._delaying or not self._sticks_end_hold()):
             return False
         for mode in (Mode.POSCTL, Mode.ALTCTL, Mode.STABILIZED):
             if self.cannot_fly(mode) is None:
@@ -475,17 +473,17 @@ class Commander:
         self._worst = worst
         if worst is _NONE:
             self.mode = self.intended
-            self._acting = False
+            self.failsafe = False
         elif worst is _A.DISARM:
             self._disarm("failsafe")
         elif worst in ACTION_MODES:
             self.mode = ACTION_MODES[worst]
-            self._acting = True
+            self.failsafe = True
             if self.intended is Mode.ORBIT:
                 self.intended = Mode.LOITER  # as on PX4: a circle is not taken up again
         else:
             self.mode = self.intended
-            self._acting = False
+            self.failsafe = False
 
     def _lasts(self, row: Failsafe, now_us: int) -> bool:
         """The cause has been there for as long as it must."""
@@ -526,7 +524,7 @@ class Commander:
         if known is None:
             return _A.NONE
         held_only = row.deferred and known is _A.HOLD
-        if known in ACTION_MODES and self._acting and not row.ends_with_cause and not held_only:
+        if known in ACTION_MODES and self.failsafe and not row.ends_with_cause and not held_only:
             action = self._possible(known)
             self._note(row, action)
             return action
@@ -568,7 +566,7 @@ class Commander:
 
     def _choose(self, mode: Mode) -> None:
         self.intended = self.mode = mode
-        self._acting = self._delaying = False
+        self.failsafe = self._delaying = False
         self._worst = _A.NONE
         self._tripped = {name: known for name, known in self._tripped.items() if name not in self._overridden}
 
@@ -726,10 +724,10 @@ def _position_inaccurate(commander: Commander) -> bool:
 
 
 def _estimate_lost(need: Need, name: str) -> Callable[[Commander], bool]:
-    valid = attrgetter(f"situation.{name}_valid")
+    valid = attrgetter(f"{name}_valid")
 
     def tripped(commander: Commander) -> bool:
-        return not valid(commander) and need in modes.TABLE[commander.intended].needs
+        return not valid(commander.situation) and need in modes.TABLE[commander.intended].needs
 
     return tripped
 
@@ -744,11 +742,11 @@ def _fallback_action(commander: Commander) -> Action:
 
 def _tilted(axis: str, parameter: str) -> Callable[[Commander], bool]:
     """Not where the mode turns the vehicle by rates: ACRO, and OFFBOARD with rates."""
-    angle_rad = attrgetter(f"situation.{axis}_rad")
+    angle_rad = attrgetter(f"{axis}_rad")
 
     def tripped(commander: Commander) -> bool:
         limit_deg = commander.parameters[parameter]
-        if not limit_deg or not abs(angle_rad(commander)) > radians(limit_deg):
+        if not limit_deg or not abs(angle_rad(commander.situation)) > radians(limit_deg):
             return False
         if commander.mode is Mode.OFFBOARD:
             return Need.ATTITUDE in commander.situation.stream_needs

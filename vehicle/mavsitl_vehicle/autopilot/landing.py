@@ -30,6 +30,7 @@ class LandDetector:
 
     Attributes:
         state: ON_GROUND, TAKING_OFF or IN_AIR.
+        on_ground: the state is ON_GROUND.
         held: in the clamp.
         released_us: when the clamp opened or the take-off began, the flight's time zero; None: not yet.
     """
@@ -39,6 +40,7 @@ class LandDetector:
         stands still on little thrust.
         """
         self.state = ON_GROUND
+        self.on_ground = True
         self.held = clamped
         self.released_us: int | None = None
         self._hover_thrust = hover_thrust
@@ -49,12 +51,8 @@ class LandDetector:
         """Height and velocity, with the sensors' noise filtered out."""
         self._share = min(period_s / FILTER_S, 1.0)
 
-    @property
-    def on_ground(self) -> bool:
-        return self.state == ON_GROUND
-
     def update(
-        self, now_us: int, estimate: Sequence[float], thrust: float, *, armed: bool, ready: bool, landing: bool
+        self, now_us: int, estimate: Sequence[float], thrust: float, armed: bool, ready: bool, landing: bool
     ) -> bool:
         """One period; whether the take-off began in it.
 
@@ -63,20 +61,23 @@ class LandDetector:
         """
         share = self._share
         z, vx, vy, vz = self._smooth
-        self._smooth = (
-            z + share * (estimate[2] - z),
-            vx + share * (estimate[3] - vx),
-            vy + share * (estimate[4] - vy),
-            vz + share * (estimate[5] - vz),
-        )
-        if self.state != ON_GROUND:
-            if armed or not self.held:
-                little = not armed or thrust < LOW_THRUST_SHARE * self._hover_thrust
-                self._watch(now_us, little or (landing and self._knows_height))
+        z += share * (estimate[2] - z)
+        vx += share * (estimate[3] - vx)
+        vy += share * (estimate[4] - vy)
+        vz += share * (estimate[5] - vz)
+        self._smooth = z, vx, vy, vz
+        if not self.on_ground:
+            if z - self._ground_m > AIRBORNE_HEIGHT_M:
+                self.state = IN_AIR
+                if self._knows_height:
+                    self._still_since_us = None
+                    return False
+            little = not armed or thrust < LOW_THRUST_SHARE * self._hover_thrust
+            self._watch(now_us, little or (landing and self._knows_height))
             return False
         if not (armed and ready and thrust >= TAKEOFF_THRUST_SHARE * self._hover_thrust):
             return False
-        self.state = IN_AIR if self.held else TAKING_OFF
+        self._become(IN_AIR if self.held else TAKING_OFF)
         self.held = False
         self.released_us = now_us
         if not self._knows_height:
@@ -85,12 +86,8 @@ class LandDetector:
         return True
 
     def _watch(self, now_us: int, landing: bool) -> None:
+        """Low, or at a height that is not known: does it stand still?"""
         z, vx, vy, vz = self._smooth
-        if z - self._ground_m > AIRBORNE_HEIGHT_M:
-            self.state = IN_AIR
-            if self._knows_height:
-                self._still_since_us = None
-                return
         low = z < LANDED_HEIGHT_M or not self._knows_height
         still = low and abs(vz) < LANDED_SPEED_M_S and hypot(vx, vy) < LANDED_SPEED_M_S
         if not (still and landing):
@@ -98,9 +95,13 @@ class LandDetector:
         elif self._still_since_us is None:
             self._still_since_us = now_us
         elif now_us - self._still_since_us >= (LANDING_TIME_US if self._knows_height else UNSURE_LANDING_TIME_US):
-            self.state = ON_GROUND
+            self._become(ON_GROUND)
 
     def put_back(self) -> None:
         """The clamp has taken the vehicle again."""
         self.held = True
-        self.state = ON_GROUND
+        self._become(ON_GROUND)
+
+    def _become(self, state: int) -> None:
+        self.state = state
+        self.on_ground = state == ON_GROUND

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from math import atan2, cos, isfinite, nan, pi, remainder, sin, sqrt
 from typing import Any, NamedTuple, Protocol
 
+from msgspec import Struct
+
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Quaternion, Vector, flip_quaternion, flip_vector
 from mavsitl.quaternion import rotate
@@ -39,7 +41,7 @@ NORM_TOLERANCE = 0.01
 """How far a setpoint's quaternion may be from unit length; float32 and honest clients stay within 1e-6."""
 
 
-class AttitudeSetpoint(NamedTuple):
+class AttitudeSetpoint(Struct, frozen=True):
     """Hold `attitude` (FLU -> NWU); turn the heading at `yaw_rate_rad_s` about the world's z axis (NaN: not asked)."""
 
     attitude: Quaternion
@@ -47,14 +49,14 @@ class AttitudeSetpoint(NamedTuple):
     thrust: float
 
 
-class RateSetpoint(NamedTuple):
+class RateSetpoint(Struct, frozen=True):
     """Hold the body rates (FLU); a NaN yaw rate means 'as it is'."""
 
     omega_flu_rad_s: Vector
     thrust: float
 
 
-class TorqueSetpoint(NamedTuple):
+class TorqueSetpoint(Struct, frozen=True):
     """Body torque in shares of the airframe's largest (FLU, -1..1) and collective thrust (0..1): U_1..U_4."""
 
     torque: Vector
@@ -120,20 +122,23 @@ class Refusal(NamedTuple):
 
 ATTITUDE_TARGET_FIELDS = tuple(
     name
-    for name in ("type_mask", "q", "body_roll_rate", "body_pitch_rate", "body_yaw_rate", "thrust", "thrust_body")
+    for name in ("q", "body_roll_rate", "body_pitch_rate", "body_yaw_rate", "thrust", "type_mask", "thrust_body")
     if name in mavlink.MAVLink_set_attitude_target_message.fieldnames
 )
-"""Of SET_ATTITUDE_TARGET, what `from_attitude_target` takes; `thrust_body` where the dialect has it."""
+"""Of SET_ATTITUDE_TARGET, what `from_attitude_target` takes, arrays by element; `thrust_body` where there is one."""
 
 
 def from_attitude_target(
-    type_mask: int,
-    q: Sequence[float],
+    w: float,
+    x: float,
+    y: float,
+    z: float,
     roll_rate: float,
     pitch_rate: float,
     yaw_rate: float,
     thrust: float,
-    thrust_body: Sequence[float] | None = None,
+    type_mask: int,
+    *thrust_body: float,
 ) -> Setpoint | Refusal:
     """SET_ATTITUDE_TARGET, PX4's reading of `type_mask`.
 
@@ -144,7 +149,7 @@ def from_attitude_target(
     quaternion that is not of unit length, refuses the whole message.
     """
     if type_mask & THRUST_BODY_SET:
-        if thrust_body is None:
+        if not thrust_body:
             return Refusal("SET_ATTITUDE_TARGET refused: THRUST_BODY_SET needs thrust_body, not in this dialect")
         thrust = -thrust_body[2]
     use_attitude = not type_mask & ATTITUDE_IGNORE
@@ -160,7 +165,6 @@ def from_attitude_target(
         return Refusal(f"SET_ATTITUDE_TARGET refused: body_yaw_rate is {yaw_rate:g}")
     thrust = 0.0 if thrust < 0.0 else 1.0 if thrust > 1.0 else thrust
     if use_attitude:
-        w, x, y, z = q
         norm = sqrt(w * w + x * x + y * y + z * z)
         if not abs(norm - 1.0) <= NORM_TOLERANCE:
             return Refusal(f"SET_ATTITUDE_TARGET refused: |q| is {norm:.3g}, need 1")

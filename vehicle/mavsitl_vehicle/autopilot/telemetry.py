@@ -9,6 +9,8 @@ from math import atan2, hypot, inf, nan, pi, sqrt
 from struct import Struct
 from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
+import msgspec
+
 from mavsitl import __version__
 from mavsitl.codec import EncodeError, Packer, packer
 from mavsitl.dialect import mavlink
@@ -100,7 +102,7 @@ class Metadata(NamedTuple):
     crc: int
 
 
-class Accuracy(NamedTuple):
+class Accuracy(msgspec.Struct, frozen=True):
     """1-sigma of the estimate, and ODOMETRY's covariances made of it: upper right triangles, row by row, packed."""
 
     position_m: float
@@ -520,11 +522,12 @@ def send_odometry(subject: Subject, node: Node, now_us: int) -> bool:
     """PX4's frames: pose in LOCAL_NED, velocity in LOCAL_NED (child_frame_id), body rates in FRD."""
     quality = subject.accuracy
     x, y, z, vx, vy, vz, q0, q1, q2, q3, p, q, r = subject.estimate
-    node.send(
-        _ODOMETRY, now_us, _LOCAL_NED, _LOCAL_NED,
+    frame = _ODOMETRY(
+        node.sequence, node.system_id, node.component_id, now_us, _LOCAL_NED, _LOCAL_NED,
         x, -y, -z, (q0, q1, -q2, -q3), vx, -vy, -vz, p, -q, -r,
         quality.pose_covariance, quality.velocity_covariance, 0, _BY_AUTOPILOT, 100,
     )  # fmt: skip
+    node.queue(frame)
     return True
 
 

@@ -179,6 +179,8 @@ class WindField:
 
     def _stack(self) -> None:
         self.coefficients = np.vstack((np.zeros((0, N_COLUMNS)), *self._rows, *self._gusts.values()))
+        self.gusty = bool(np.isin(self.coefficients[:, MODEL], (GUST_PULSE, GUST_RAMP)).any())
+        """It goes by the flight's time."""
 
     def blow(self, vehicle: int, gust: Gust | None) -> None:
         """A gust on one vehicle, on top and in place of its last one; it needs no normals. None: it is over."""
