@@ -31,7 +31,7 @@ _FIELD = re.compile(r"(?P<type>[a-z0-9_]+?)(?:\[(?P<count>[1-9][0-9]*)\])? (?P<n
 
 DATA_MESSAGE = ord("D")
 
-EVERY, CHANGE, SECOND = "every control period", "at a change", "1 Hz"
+EVERY, CHANGE, SECOND = "every period", "at a change", "1 Hz"
 """Rates of topics."""
 
 
@@ -204,7 +204,7 @@ ACTUATOR_MOTORS = Topic(
 ROTOR_STATUS = Topic(
     "rotor_status",
     ("float[4] speed_rad_s", "uint8_t saturated"),
-    text="Speeds as they are; bit 0 of `saturated`: allocation was at a limit.",
+    text="Speeds as they are; `saturated` is not 0 where allocation was at a limit.",
 )
 
 # Vehicle: states
