@@ -19,6 +19,8 @@
     A section for each group of the vehicle's parameters: name, type, default, allowed values, meaning.
 ``{chaos-modes}``
     What a vehicle does wrong on command: a table for each group of modes.
+``{suite}``
+    The cases of the score board: group, scenario and settings.
 ``{cli-help} SUBCOMMAND``
     What ``mavsitl SUBCOMMAND --help`` prints.
 """
@@ -51,6 +53,7 @@ from sphinx.util.typing import ExtensionMetadata
 from mavsitl import chaos, scenario
 from mavsitl.dialect import mavlink
 from mavsitl.ends import NullRecorder
+from mavsitl.score import suite
 
 UNITS = {
     "hz": "Hz",
@@ -653,6 +656,21 @@ def size_text(size: failures.Size) -> str:
     return f"{size.minimum:g} to {size.maximum:g}; without one {size.default:g}: {size.text(size.default)}"
 
 
+class SuiteTable(GeneratedDirective):
+    """`mavsitl/score/suite-N.toml`."""
+
+    def run(self) -> list[nodes.Node]:
+        rows = []
+        for case in suite.read().cases:
+            settings = [f"{key} = {toml(value)}" for key, value in case.settings.items()]
+            cell: list[nodes.Node] = []
+            for setting in settings:
+                cell += [nodes.Text(", ")] * bool(cell) + self.code(setting)
+            name = self.code(case.name) + self.text(" (quick)" if case.quick else "")
+            rows.append([self.text(case.group), name, self.code(case.scenario), cell])
+        return [self.table(("group", "case", "scenario", "settings"), rows)]
+
+
 class CliHelp(GeneratedDirective):
     optional_arguments = 1
 
@@ -685,5 +703,6 @@ def setup(app: Sphinx) -> ExtensionMetadata:
     app.add_directive("failures", FailureTable)
     app.add_directive("parameter-tables", ParameterTables)
     app.add_directive("chaos-modes", ChaosModes)
+    app.add_directive("suite", SuiteTable)
     app.add_directive("cli-help", CliHelp)
     return {"version": "1", "parallel_read_safe": True}

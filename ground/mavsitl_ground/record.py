@@ -10,7 +10,7 @@ from mavsitl.log import topics
 from mavsitl.log.block import Block, ned
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
-from mavsitl_ground import cycle, seat
+from mavsitl_ground import cycle
 
 _DESIRED = slice(cycle.DESIRED, cycle.DESIRED + 3)
 _BY_NET = [cycle.WEIGHTS + k for k in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
@@ -34,15 +34,16 @@ def block(recorder: Recorder, flight: Flight, *, with_weights: bool, own: bool =
         acceleration, wind = v[:, cycle.ACCELERATION :][:, :3], v[:, cycle.WIND :][:, :3]
         return np.hstack((v[:, cycle.U1, np.newaxis], acceleration * per_u, wind))
 
+    width = cycle.COLUMNS + (topics.MOST_LOGGED if own else 0)
     columns = [
         (topics.TRAJECTORY_SETPOINT, trajectory),
         (topics.ATTITUDE_SETPOINT, _attitude_setpoint),
-        (topics.OWN_CONTROLLER, lambda v: v[:, seat.OWN :]) if own else (topics.CONTROL_DEMAND, control_demand),
+        (topics.OWN_CONTROLLER, lambda v: v[:, cycle.COLUMNS :]) if own else (topics.CONTROL_DEMAND, control_demand),
         (topics.LINK_STATUS, lambda v: v[:, cycle.LINK : cycle.LINK + 4]),
     ]
     if with_weights:
         columns.append((topics.PIDNN_WEIGHTS, lambda v: v[:, _BY_NET]))
-    return Block(recorder, seat.COLUMNS if own else cycle.COLUMNS, columns)
+    return Block(recorder, width, columns)
 
 
 def _attitude_setpoint(v: Floats) -> Floats:

@@ -25,6 +25,7 @@ from mavsitl.controllers import (
     vector,
 )
 from mavsitl.frames import Quaternion, Vector, flip_quaternion, flip_vector
+from mavsitl.log import topics
 from mavsitl.node import Node
 from mavsitl.quaternion import IDENTITY, to_euler
 from mavsitl.scenario import Flight
@@ -37,8 +38,7 @@ from mavsitl_ground.reference import reference_for
 controllers.not_theirs(__file__)
 
 OWN = cycle.COLUMNS
-COLUMNS = OWN + controllers.MOST_LOGGED
-"""Of a row: those of the paper's controller, of which this fills what it knows, and what the controller logs."""
+"""A row has the columns of the paper's controller, of which this fills what it knows; then what the controller logs."""
 
 
 class Seat:
@@ -48,7 +48,6 @@ class Seat:
     """
 
     learns = False
-    columns = COLUMNS
 
     def __init__(self, flight: Flight, offset_nwu_m: Vector, failed: Callable[[ControllerError], None]) -> None:
         """`offset_nwu_m` moves the reference; `failed` is told what went wrong. Raises `ControllerError`."""
@@ -168,8 +167,8 @@ class Seat:
         if not hasattr(self._controller, "log"):
             return
         values = np.asarray(self._controller.log(), dtype=np.float64).ravel()
-        if len(values) > controllers.MOST_LOGGED:
-            raise ControllerError(f"log() gave {len(values)} numbers; allowed: {controllers.MOST_LOGGED} at most")
+        if len(values) > topics.MOST_LOGGED:
+            raise ControllerError(f"log() gave {len(values)} numbers; allowed: {topics.MOST_LOGGED} at most")
         row[OWN : OWN + len(values)] = values
 
     def _fail(self, error: Exception, where: str) -> None:

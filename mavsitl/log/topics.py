@@ -222,7 +222,9 @@ CONTROL_DEMAND = Topic("control_demand", ("float[4] u", "float[3] wind_accelerat
 LINK_STATUS = Topic("link_status", ("uint32_t received", "uint32_t lost", "uint32_t bad", "uint32_t state_age_us"))
 """Counts since the start: frames received, lost by sequence number, and refused; age of the state used, us."""
 
-OWN_CONTROLLER = Topic("own_controller", ("float[8] value",))
+MOST_LOGGED = 8
+"""Numbers in a row of the next."""
+OWN_CONTROLLER = Topic("own_controller", (f"float[{MOST_LOGGED}] value",))
 """What a controller of the user's own has logged, in its own terms; NaN where it has fewer."""
 
 VEHICLE_TOPICS = (
