@@ -172,4 +172,4 @@ def test_score_has_every_shipped_controller(capsys: pytest.CaptureFixture[str]) 
     page = capsys.readouterr().out
     assert "| `stock` | **100** |" in page
     assert all(f"| `{name}` | **" in page for name in controllers.shipped())
-    assert "0 of 5 |" in page
+    assert "0 of 6 |" in page
