@@ -8,8 +8,8 @@ World NWU (north, west, up), body FLU (forward, left, up), SI units, quaternions
 are NumPy arrays (3,), read-only. `time_s` is flight time by the vehicle's clock.
 
 Two more are called where it has them: ``reset()`` before a flight, and each time the vehicle has been out of OFFBOARD
-(without it a new object is made), and ``log()`` after each update, for up to `MOST_LOGGED` numbers that are to be in
-the log, topic `own_controller`.
+(without it a new object is made), and ``log()`` after each update, for up to eight numbers that are to be in the
+log, topic `own_controller`.
 """
 
 from __future__ import annotations
@@ -46,8 +46,6 @@ GROUP = "mavsitl.controller"
 """Of the entry points: ``name = "module:Controller"``."""
 PAPER = ("pidnn", "pid")
 """The paper's own laws. They are compiled and have a place in the scenario, `controller.law`."""
-MOST_LOGGED = 8
-"""Numbers of a controller's own in each row of its log."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@
     Of `mavsitl.testing`: a class out of its docstrings; the plugin's fixtures; its options and its marker.
 ``{log-topics} END``
     The ULog topics that the vehicle, or the ground, writes: fields, when there is a row, what it says.
+``{suite}``
+    The cases of the score board: group, scenario and settings.
 ``{cli-help} SUBCOMMAND``
     What ``mavsitl SUBCOMMAND --help`` prints.
 """
@@ -58,6 +60,7 @@ from mavsitl import chaos, scenario, testing
 from mavsitl.dialect import mavlink
 from mavsitl.ends import NullRecorder
 from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS, Topic
+from mavsitl.score import suite
 from mavsitl.testing import plugin
 
 UNITS = {
@@ -681,6 +684,21 @@ class LogTopics(GeneratedDirective):
         return [self.table(("topic", "rows", "what, and fields"), rows)]
 
 
+class SuiteTable(GeneratedDirective):
+    """`mavsitl/score/suite-N.toml`."""
+
+    def run(self) -> list[nodes.Node]:
+        rows = []
+        for case in suite.read().cases:
+            settings = [f"{key} = {toml(value)}" for key, value in case.settings.items()]
+            cell: list[nodes.Node] = []
+            for setting in settings:
+                cell += [nodes.Text(", ")] * bool(cell) + self.code(setting)
+            name = self.code(case.name) + self.text(" (quick)" if case.quick else "")
+            rows.append([self.text(case.group), name, self.code(case.scenario), cell])
+        return [self.table(("group", "case", "scenario", "settings"), rows)]
+
+
 class CliHelp(GeneratedDirective):
     optional_arguments = 2
 
@@ -839,6 +857,7 @@ def setup(app: Sphinx) -> ExtensionMetadata:
     app.add_directive("parameter-tables", ParameterTables)
     app.add_directive("chaos-modes", ChaosModes)
     app.add_directive("log-topics", LogTopics)
+    app.add_directive("suite", SuiteTable)
     app.add_directive("cli-help", CliHelp)
     app.add_directive("testing-class", TestingClass)
     app.add_directive("testing-fixtures", TestingFixtures)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import acos, cos, degrees, exp, radians, sqrt
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from mavsitl.control.filters import FirstOrder
 from mavsitl.control.inner_loop import InnerLoop
 from mavsitl.control.pid import PositionLoop
 from mavsitl.control.wind_observer import WindObserver
-from mavsitl.controllers import ControllerError
 from mavsitl.dialect import mavlink
 from mavsitl.frames import Vector, flip_quaternion, flip_vector
 from mavsitl.log.ulog import Recorder
@@ -32,8 +31,11 @@ from mavsitl_ground.demand import SENDS, Send
 from mavsitl_ground.observer import Observer
 from mavsitl_ground.record import block
 from mavsitl_ground.reference import reference_for
-from mavsitl_ground.seat import Seat
 from mavsitl_ground.sequence import ENDED, NOW, Handshake, Phase
+
+if TYPE_CHECKING:
+    from mavsitl.controllers import ControllerError
+    from mavsitl_ground.seat import Seat
 
 SYSTEM_ID = 250
 COMPONENT_ID = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -196,7 +198,9 @@ class Ground:
         self._report = report
         self._controller: Controller | Seat
         self._send_demand: Send
-        if scenario.controller.own:
+        if own := bool(scenario.controller.own):
+            from mavsitl_ground.seat import Seat  # here, for few need it
+
             self._controller = Seat(flight, offset_nwu_m, self._on_broken)
             self._send_demand = self._controller.send
         else:
@@ -223,7 +227,6 @@ class Ground:
         self._down_since_us: int | None = None
         self._has_flown = False
         self._heartbeat_us = -HEARTBEAT_INTERVAL_US
-        own = isinstance(self._controller, Seat)
         self._rows = block(recorder, flight, with_weights=self._controller.learns, own=own)
         self._now_us = 0
         self._due_us = NOW

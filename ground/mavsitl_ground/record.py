@@ -9,7 +9,7 @@ from mavsitl.log import topics
 from mavsitl.log.block import Block, columns
 from mavsitl.log.ulog import Recorder
 from mavsitl.scenario import Flight
-from mavsitl_ground import cycle, seat
+from mavsitl_ground import cycle
 
 
 def block(recorder: Recorder, flight: Flight, *, with_weights: bool, own: bool = False) -> Block:
@@ -33,12 +33,13 @@ def block(recorder: Recorder, flight: Flight, *, with_weights: bool, own: bool =
         y, z = cx * sy * cz + sx * cy * sz, cx * cy * sz - sx * sy * cz
         return np.column_stack((rows[:, cycle.DESIRED : cycle.U1], w, x, y, z, np.zeros(len(rows))))
 
+    width = cycle.COLUMNS + (topics.MOST_LOGGED if own else 0)
     found = [
         (topics.TRAJECTORY_SETPOINT, columns(cycle.POSITION, cycle.DESIRED)),
         (topics.ATTITUDE_SETPOINT, attitude_setpoint),
-        (topics.OWN_CONTROLLER, columns(seat.OWN, seat.COLUMNS)) if own else (topics.CONTROL_DEMAND, control_demand),
+        (topics.OWN_CONTROLLER, columns(cycle.COLUMNS, width)) if own else (topics.CONTROL_DEMAND, control_demand),
         (topics.LINK_STATUS, columns(cycle.LINK, cycle.WEIGHTS)),
     ]
     if with_weights:
         found.append((topics.PIDNN_WEIGHTS, columns(cycle.WEIGHTS, cycle.COLUMNS)))
-    return Block(recorder, seat.COLUMNS if own else cycle.COLUMNS, found)
+    return Block(recorder, width, found)

@@ -166,8 +166,8 @@ class Handshake:
         self._enter(Phase.STOP, now_us)
 
     def fail(self, how: str, now_us: int) -> None:
-        """The controller cannot go on: the vehicle lands, or is disarmed where there is no ground."""
-        if self.phase is Phase.FLY:
+        """The controller cannot go on: a vehicle that flies lands, or is disarmed where there is no ground."""
+        if self.phase not in (*ENDED, Phase.STOP):
             self.lost = how
             self._client.cancel()
             self._enter(Phase.STOP, now_us)

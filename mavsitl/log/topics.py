@@ -424,7 +424,9 @@ LINK_STATUS = Topic(
     text="Counts since the start: frames received, lost by sequence number, and refused; age of the state used.",
 )
 
-OWN_CONTROLLER = Topic("own_controller", ("float[8] value",))
+MOST_LOGGED = 8
+"""Numbers in a row of the next."""
+OWN_CONTROLLER = Topic("own_controller", (f"float[{MOST_LOGGED}] value",))
 """What a controller of the user's own has logged, in its own terms; NaN where it has fewer."""
 
 VEHICLE_TOPICS = (

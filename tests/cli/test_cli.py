@@ -59,7 +59,7 @@ HELP = {
              "--search-seed", "--jobs", "--scheduler", "--output", "--set", "--json", "report.html", "rows.jsonl",
              "mavsitl tune my.toml"),
     "bench": ("CONTROLLER", "--program", "--quick", "--case", "--seeds", "--only", "--jobs", "--speed", "--output",
-              "--no-report", "--json", "rows.jsonl", "mavsitl bench my.py:MyController"),
+              "--json", "{url}", "{reference}", "bench.json", "mavsitl bench my.py:MyController"),
     "report": ("RUN", "run.json", "report.html"),
     "scenarios": ("--json",),
     "completion": ("bash", "zsh", "fish", 'eval "$(mavsitl completion bash)"'),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mavsitl_ground.sequence import Handshake, Phase
 
 from mavsitl import controllers, ends
 from mavsitl.controllers import AttitudeDemand, PositionDemand, RateDemand, Reference, State
@@ -169,6 +170,15 @@ def test_a_failure_is_told_once_and_the_vehicle_lands(
     assert outcome.simulated_s < 20.0, "landed, not waited for"
     assert len([text for text in told if said in text]) == 1
     assert len([each for each in Breaks.seen if each[0] >= 0.5]) == 1, "it is not asked again"
+
+
+def test_a_controller_that_fails_on_the_ground_is_not_flown() -> None:
+    """In its reset, say, before another flight."""
+    handshake = Handshake(lambda *command: None, [], land=True, report=lambda text: None)
+    handshake.fail("broken", 0)
+    handshake.step(1000)
+    assert handshake.phase is Phase.LOST
+    assert handshake.lost == "broken"
 
 
 @given(force=st.tuples(Floats, Floats, Floats), yaw=st.floats(-10.0, 10.0))

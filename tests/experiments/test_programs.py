@@ -9,9 +9,10 @@ from typing import Any
 import msgspec
 import pytest
 
+from mavsitl import controllers
 from mavsitl.campaign.fly import Row, fly
 from mavsitl.report.metrics import PAPER_TABLES
-from tests.experiments import engine, failures, learning, limits, links, results, stability
+from tests.experiments import engine, failures, learning, limits, links, results, score, stability
 
 SHORT: dict[str, Any] = {"duration_s": 2.0}
 
@@ -164,3 +165,11 @@ def test_links_counts_lost_flights_beside_the_median() -> None:
     assert links.cell(flown) == "0.500 m, 5.00°"
     assert links.cell([*flown, lost]) == "0.500 m, 5.00° (1 of 3 lost)"
     assert links.cell([flown[0], lost, lost]) == "lost"
+
+
+def test_score_has_every_shipped_controller(capsys: pytest.CaptureFixture[str]) -> None:
+    assert score.main(["--quick", "--jobs", "1"]) == 0
+    page = capsys.readouterr().out
+    assert "| `stock` | **100** |" in page
+    assert all(f"| `{name}` | **" in page for name in controllers.shipped())
+    assert "0 of 6 |" in page
