@@ -39,6 +39,11 @@ class Block:
         row: Array = self._values[index]
         return row
 
+    def preset(self, columns: slice, values: Array) -> None:
+        """From the next row on these columns hold these values, where who fills a row leaves them alone."""
+        self.drain()
+        self._values[:, columns] = values
+
     def drain(self) -> None:
         """Hand over what was gathered."""
         count, self._count = self._count, 0
