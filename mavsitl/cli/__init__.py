@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from mavsitl import __version__, process
-from mavsitl.cli import ask, check, fly, ground, lists, sweep, tune, vehicle
+from mavsitl.cli import ask, check, fly, ground, lists, sweep, tune, vehicle, view
 from mavsitl.cli.common import EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE, Formatter, Interrupted, UsageError
 
 DESCRIPTION = (
@@ -77,7 +77,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
     for add in (
         fly.add, vehicle.add, ground.add, check.add, ask.add_link, ask.add_inject, ask.add_param, sweep.add, tune.add,
-        lists.add_report, lists.add_scenarios, lists.add_chaos,
+        view.add, lists.add_report, lists.add_scenarios, lists.add_chaos,
     ):  # fmt: skip
         add(commands)
     return parser
