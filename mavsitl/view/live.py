@@ -368,7 +368,6 @@ class Station:
                 node.send_message(_HEARTBEAT)
         for craft in self._crafts.values():
             self._step_craft(craft, now_us)
-        self.model.advance()
 
     def _step_craft(self, craft: _Craft, now_us: int) -> None:
         vehicle, out = craft.vehicle, craft.out

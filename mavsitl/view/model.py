@@ -119,7 +119,7 @@ class Vehicle:
         self.number = number
         self.values: dict[str, Value] = {}
         self.changed: dict[str, int] = {}
-        """The tick of each value's last change."""
+        """The number of each value's last change, as `Model.change` gives them."""
         self.rows: deque[Row] = deque(maxlen=ROWS)
         self.rows_made = 0
         self.chapter = model.next_chapter()
@@ -130,20 +130,20 @@ class Vehicle:
         self.link = Loss()
         """Of its link to the ground, or to here."""
         self._model = model
-        self._row_us = 0
+        self._row_due_us = 0
 
     def put(self, name: str, value: Value) -> None:
         """Set a value; it is sent if it is another than before."""
         if self.values.get(name) != value or name not in self.values:
             self.values[name] = value
-            self.changed[name] = self._model.tick
+            self.changed[name] = self._model.change()
 
     def begin(self, rows: Iterable[Row] = ()) -> None:
         """Rows begin anew, with these."""
         self.rows.clear()
         self.rows_made = 0
         self.chapter = self._model.next_chapter()
-        self._row_us = 0
+        self._row_due_us = 0
         self.put("chapter", self.chapter)
         for row in rows:
             self.add(row)
@@ -168,8 +168,8 @@ class Vehicle:
             return
         self.time_us = time_us
         self.put("time_s", round(time_us * 1e-6, 2))
-        if time_us - self._row_us >= ROW_INTERVAL_US or not self._row_us:
-            self._row_us = time_us
+        if time_us >= self._row_due_us:
+            self._row_due_us = max(self._row_due_us + ROW_INTERVAL_US, time_us + ROW_INTERVAL_US // 4)
             self.add(row_of(self.values))
 
     def fresh(self, kind: str, now_us: int, limit_us: int) -> bool:
@@ -213,8 +213,10 @@ class Seen:
     """What a client has been sent. All is new to one that has just come."""
 
     def __init__(self) -> None:
-        self.tick = -1
+        self.changes = 0
+        """The last change of a value."""
         self.texts = 0
+        self.texts_chapter: int | None = None
         self.selected: int | None = None
         """The vehicle whose rows are sent."""
         self.chapter: tuple[int, int] | None = None
@@ -223,22 +225,23 @@ class Seen:
 
 
 class Model:
-    """Vehicles by system id, texts, and values of the whole.
-
-    Attributes:
-        tick: counts the updates; values that change are marked with it.
-    """
+    """Vehicles by system id, texts, and values of the whole."""
 
     def __init__(self) -> None:
-        self.tick = 0
+        self._changes = 0
         self.vehicles: dict[int, Vehicle] = {}
         self.world: dict[str, Value] = {}
         self._chapters = 0
         self._world_changed: dict[str, int] = {}
         self._texts: deque[dict[str, Value]] = deque(maxlen=MAX_TEXTS)
         self._texts_made = 0
-        self._texts_begin = 0
-        """Number of the first text that is still true: a replay that is moved forgets."""
+        self._texts_chapter = 0
+        """Another number each time that all are forgotten: a replay is moved."""
+
+    def change(self) -> int:
+        """The number of one more change of a value, from 1."""
+        self._changes += 1
+        return self._changes
 
     def next_chapter(self) -> int:
         """A number that no chapter had."""
@@ -256,7 +259,7 @@ class Model:
         """A value of the whole."""
         if self.world.get(name) != value or name not in self.world:
             self.world[name] = value
-            self._world_changed[name] = self.tick
+            self._world_changed[name] = self.change()
 
     def say(self, vehicle: int, severity: int, text: str, time_s: float | None) -> None:
         """A text; `severity` is MAV_SEVERITY."""
@@ -267,7 +270,7 @@ class Model:
 
     def forget_texts(self) -> None:
         self._texts.clear()
-        self._texts_begin = self._texts_made
+        self._texts_chapter = self.next_chapter()
 
     def clear(self) -> None:
         """No vehicles any more: another flight is replayed."""
@@ -276,24 +279,24 @@ class Model:
         self.put("chapter", self.next_chapter())
 
     def news(self, seen: Seen) -> dict[str, Value]:
-        """What `seen` has not seen; empty: nothing. It has, from now on. Call `advance` when all were served."""
+        """What `seen` has not seen; empty: nothing. It has, from now on."""
         news: dict[str, Value] = {}
-        world = {name: self.world[name] for name, tick in self._world_changed.items() if tick > seen.tick}
+        world = {name: self.world[name] for name, change in self._world_changed.items() if change > seen.changes}
         if world:
             news["world"] = world
         vehicles = {}
         for number, vehicle in self.vehicles.items():
-            changed = {name: vehicle.values[name] for name, tick in vehicle.changed.items() if tick > seen.tick}
+            changed = {name: vehicle.values[name] for name, change in vehicle.changed.items() if change > seen.changes}
             if changed:
                 vehicles[number] = changed
         if vehicles:
             news["vehicles"] = vehicles
+        if seen.texts_chapter != self._texts_chapter:
+            news["forget_texts"] = True
         if self._texts_made > seen.texts:
             news["texts"] = [text for text in self._texts if text["number"] > seen.texts]
-        if seen.texts < self._texts_begin or (seen.tick < 0 and "texts" not in news):
-            news["forget_texts"] = True
         self._add_rows(news, seen)
-        seen.tick, seen.texts = self.tick, self._texts_made
+        seen.changes, seen.texts, seen.texts_chapter = self._changes, self._texts_made, self._texts_chapter
         return news
 
     def _add_rows(self, news: dict[str, Value], seen: Seen) -> None:
@@ -306,10 +309,6 @@ class Model:
         if rows or whole:
             news["rows"] = {"vehicle": vehicle.number, "whole": whole, "rows": rows}
         seen.chapter, seen.rows = chapter, vehicle.rows_made
-
-    def advance(self) -> None:
-        """What changes from here on is new to everybody."""
-        self.tick += 1
 
 
 # --- messages --------------------------------------------------------------------------------------------------------

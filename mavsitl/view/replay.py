@@ -321,7 +321,6 @@ class Replay:
                 self._at_us = self._end_us
                 self._playing = False
             self._show()
-        self.model.advance()
 
     def _show(self) -> None:
         time_us = int(self._at_us)

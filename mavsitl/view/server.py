@@ -323,7 +323,7 @@ class Page:
                 continue
             client.due_us = now_us + client.pace_us
             seen = client.seen
-            key = (seen.tick, seen.texts, seen.selected, seen.chapter, seen.rows)
+            key = (seen.changes, seen.texts, seen.texts_chapter, seen.selected, seen.chapter, seen.rows)
             news = self._source.model.news(seen)
             if not news:
                 continue

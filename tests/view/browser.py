@@ -91,13 +91,12 @@ class Tab:
             raise RuntimeError(f"{expression}: {result['exceptionDetails']}")
         return result["result"].get("value")
 
-    def wait(self, expression: str, patience_s: float = PATIENCE_S) -> Any:
-        """Until the expression is true, and its value. Raises `TimeoutError`, with what the page shows."""
+    def wait(self, expression: str, patience_s: float = PATIENCE_S) -> None:
+        """Until the expression is true. Raises `TimeoutError`, with what the page shows."""
         end_s = monotonic() + patience_s
         while True:
-            value = self.value(expression)
-            if value:
-                return value
+            if self.value(f"Boolean({expression})"):
+                return
             if monotonic() > end_s:
                 shown = self.value("document.body.innerText")
                 raise TimeoutError(f"not within {patience_s:g} s: {expression}\n{shown}\n{self.errors}")
