@@ -30,7 +30,7 @@ __all__ = ["SPEEDS", "Recorded", "Replay", "Track", "find_flights"]
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
-HZ = 30.0
+HZ = 33.0
 
 Table: TypeAlias = Mapping[str, npt.NDArray[Any]]
 Tables: TypeAlias = Mapping[str, Table]

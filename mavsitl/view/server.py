@@ -399,12 +399,14 @@ async def run(
             now_us = monotonic_us()
             source.pump(now_us)
             if now_us >= due_us:
-                due_us = max(due_us + round(1e6 / source.hz), now_us)
+                interval_us = round(1e6 / source.hz)
+                due_us = max(due_us + interval_us, now_us + interval_us // 2)
                 source.step(now_us)
                 page.tell(now_us)
             if now_us >= chore_us:
                 chore_us = now_us + 1_000_000
                 chore()
-            await asyncio.sleep(PUMP_S if page.clients else 4 * PUMP_S)
+            rest_s = PUMP_S if page.clients else 4 * PUMP_S
+            await asyncio.sleep(max(min(rest_s, (due_us - monotonic_us()) * 1e-6), 0.0))
     finally:
         await page.close()

@@ -29,6 +29,7 @@ COMMANDS = (
     "param",
     "sweep",
     "tune",
+    "view",
     "report",
     "scenarios",
     "chaos",
@@ -41,7 +42,7 @@ HELP = {
                 "--gcs-remote", "--lockstep", "--deadline", "--run-dir", "--wing", "--status", "--speed",
                 "--until-disarmed", "--chaos", "14580", "18570", "mavsitl vehicle hover-wind --instance 1"),
     "ground": ("--link", "--system", "--vehicle", "--lockstep", "--deadline", "--run-dir", "--wing", "--status",
-               "udpin:127.0.0.1:14540", "mavsitl ground spiral-calm --link udpout:"),
+               "--monitor", "udpin:127.0.0.1:14540", "mavsitl ground spiral-calm --link udpout:"),
     "check": ("--listen", "--for", "--quiet", "--all", "--json", "14550", "14540", "18570", "Exit codes",
               "udpout:HOST:PORT", "mavsitl check --listen tcp:127.0.0.1:5760"),
     "link": ("--gcs", "--latency", "--jitter", "--loss", "--burst", "--good", "--reorder", "--duplicate", "--corrupt",
@@ -56,6 +57,9 @@ HELP = {
     "tune": ("--tune", "--evaluations", "--effort-weight", "--seeds", "--held-out", "--search-duration",
              "--search-seed", "--jobs", "--scheduler", "--output", "--set", "--json", "report.html", "rows.jsonl",
              "mavsitl tune my.toml"),
+    "view": ("RUN", "--listen", "--instance", "--count", "--monitor", "--port", "--bind", "--no-browser",
+             "--no-buttons", "--json", "--demo", "--set", "--run-dir", "18570", "14560", "token",
+             "mavsitl view --demo"),
     "report": ("RUN", "run.json", "report.html"),
     "scenarios": ("--json",),
     "chaos": ("--json", "NAME[:ARGUMENT...][@PORT]", "ack-late:2.5:NAV_TAKEOFF@gcs"),
@@ -121,7 +125,8 @@ def test_examples_in_the_help_are_accepted_by_the_parser() -> None:
         + cli.check.CHECK_EXAMPLES
         + cli.ask.LINK_EXAMPLES
         + cli.ask.INJECT_EXAMPLES
-        + cli.ask.PARAM_EXAMPLES,
+        + cli.ask.PARAM_EXAMPLES
+        + cli.view.VIEW_EXAMPLES,
         re.M,
     )
     assert len(examples) >= 30

@@ -123,7 +123,7 @@ def test_each_message_asked_for_is_one_that_the_vehicle_has() -> None:
     assert {*FAST, *STEADY, *SLOW} <= set(BY_ID)
 
 
-@pytest.mark.parametrize(("vehicles", "hz"), [(1, 30.0), (4, 30.0), (9, 20.0), (50, 12.0)])
+@pytest.mark.parametrize(("vehicles", "hz"), [(1, 33.0), (4, 33.0), (9, 20.0), (50, 12.0)])
 def test_many_vehicles_are_renewed_less_often(vehicles: int, hz: float) -> None:
     assert rate_hz(vehicles) == hz
 
@@ -207,7 +207,7 @@ def test_a_vehicle_that_restarts_is_asked_again() -> None:
     assert world.values()["chapter"] != chapter
     before = world.sent
     world.run(1.0)
-    assert world.sent - before > 2 * 25  # attitude and position at 30 Hz
+    assert world.sent - before > 2 * 40  # attitude and position at 50 Hz
 
 
 def test_several_vehicles_and_their_buttons() -> None:

@@ -70,9 +70,11 @@ export class Charts {
     this.drawnAt = now;
     const { rows } = this.store;
     const { time } = rows;
-    const from = Math.max(0, time.length - Math.ceil(WINDOW_S * 21));
-    const shown = from ? Object.fromEntries(Object.entries(rows).map(([name, values]) => [name, values.slice(from)])) : rows;
-    for (const chart of this.charts) chart.draw(shown, time.at(-1) ?? 0);
+    // The window is filled from its left, and then moves on.
+    const begin = Math.max(time[0] ?? 0, (time.at(-1) ?? 0) - WINDOW_S);
+    const first = Math.max(0, time.findLastIndex((each) => each < begin));
+    const shown = first ? Object.fromEntries(Object.entries(rows).map(([name, values]) => [name, values.slice(first)])) : rows;
+    for (const chart of this.charts) chart.draw(shown, begin);
   }
 
   /** Lines in the colours of now. */
@@ -99,6 +101,7 @@ class Chart {
     this.none = document.createElement("p");
     this.none.className = "none";
     this.none.textContent = spec.none;
+    this.from = 0;
     this.head.append(this.title);
     this.root.append(this.head, this.plot);
     place.append(this.root);
@@ -135,12 +138,12 @@ class Chart {
       {
         width: 10, height: 10, legend: { show: false }, cursor: { show: false }, padding: [0.5 * rem, second ? 0 : 0.7 * rem, 0, 0],
         scales: {
-          x: { time: false, range: () => [this.now - WINDOW_S, this.now] },
+          x: { time: false, range: () => [this.from, this.from + WINDOW_S] },
           y: { range: (plot, low, high) => this.range(low, high) },
           percent: { range: (plot, low, high) => [0, Math.max(10, high ?? 0)] },
         },
         axes: [
-          { ...lines, size: 1.25 * rem, gap: 2, space: 4 * rem, values: (plot, at) => at.map((each) => (each < 0 ? "" : `${each} s`)) },
+          { ...lines, size: 1.25 * rem, gap: 2, space: 4 * rem, values: (plot, at) => at.map((each) => `${each} s`) },
           { ...lines, size: 3.3 * rem, gap: 4, space: 1.7 * rem },
           ...(second ? [{ ...lines, scale: "percent", side: 1, size: 2.6 * rem, gap: 4, space: 1.7 * rem, grid: { show: false }, values: (plot, at) => at.map((each) => `${each} %`) }] : []),
         ],
@@ -156,7 +159,6 @@ class Chart {
       this.plot,
     );
     this.plot.append(this.none);
-    this.now = 0;
     this.resize();
   }
 
@@ -180,8 +182,8 @@ class Chart {
     return least === undefined ? [from - margin, to + margin] : [least, Math.max(to, least + span)];
   }
 
-  draw(rows, now) {
-    this.now = now;
+  draw(rows, from) {
+    this.from = from;
     const columns = this.spec.series.map((each) => each.of(rows));
     this.none.hidden = columns.some((values) => values.some((value) => value !== null));
     this.uplot.setData([rows.time, ...columns]);

@@ -110,7 +110,7 @@ function readoutsOf({ position, velocity, reference, wind, battery, time_s: time
   return {
     height: position ? `${signed(-position[2], 2)} m` : "–",
     speed: velocity ? `${length(velocity).toFixed(2)} m/s` : "–",
-    error: error === null ? "–" : `${(100 * error).toFixed(1)} cm`,
+    error: error === null ? "–" : error < 1 ? `${(100 * error).toFixed(1)} cm` : `${error.toFixed(2)} m`,
     wind: wind ? `${length(wind.velocity).toFixed(1)} m/s` : "–",
     battery: battery?.percent !== null && battery ? `${volts}  ${battery.percent} %` : volts,
     time: time === undefined ? "–" : clock(time, 1),
