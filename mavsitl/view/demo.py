@@ -14,8 +14,8 @@ from mavsitl.pair import PairError, free_ports
 
 __all__ = ["Demo"]
 
-END_S = 10.0
-"""A process that is told to end and has not by then is killed."""
+END_STEPS = 10
+"""A process that is told to end and has not in so many steps, seconds that is, is killed."""
 
 
 class Demo:
@@ -52,6 +52,8 @@ class Demo:
         self._report = report
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._said: dict[str, IO[bytes]] = {}
+        self._ending = 0
+        """Steps that are left to those which were told to end; 0: none was."""
 
     def start(self) -> None:
         for end, arguments in self._commands.items():
@@ -62,32 +64,45 @@ class Demo:
             )  # fmt: skip
 
     def step(self) -> None:
-        """Look after them. Raises `PairError` with the words of one that failed."""
+        """Look after them, without a wait. Raises `PairError` with the words of one that failed."""
         ended = [end for end, process in self._processes.items() if process.poll() is not None]
         for end in ended:
             words = self._words(end)
             if words:
                 raise PairError(f"{end}: {words}")
-        if ended:
-            self._report(f"the {' and the '.join(ended)} ended: both begin anew")
-            self.close()
+        if len(ended) == len(self._processes):
+            self._forget()
             self.start()
+        elif ended and not self._ending:
+            self._report(f"the {' and the '.join(ended)} ended: both begin anew")
+            self._ending = END_STEPS
+            for process in self._processes.values():
+                process.terminate()
+        elif self._ending:
+            self._ending -= 1
+            if not self._ending:
+                for process in self._processes.values():
+                    process.kill()
 
     def close(self) -> None:
         """End both; a second call does nothing."""
-        processes = list(self._processes.values())
-        self._processes.clear()
-        for process in processes:
+        for process in self._processes.values():
             process.terminate()
-        for process in processes:
+        for process in self._processes.values():
             try:
-                process.wait(END_S)
+                process.wait(END_STEPS)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Those that have ended."""
         for said in self._said.values():
             said.close()
         self._said.clear()
+        self._processes.clear()
+        self._ending = 0
 
     def _words(self, end: str) -> str:
         said = self._said[end]

@@ -20,9 +20,9 @@ STOP_S = 20.0
 
 
 @contextmanager
-def flying(system_id: int, to_port: int, name: str = "takeoff-hover") -> Iterator[Vehicle]:
-    """A vehicle whose link for ground stations sends to a port of loopback."""
-    flight = scenario.load(name)
+def flying(system_id: int, to_port: int, *, speed: float = 1.0) -> Iterator[Vehicle]:
+    """A vehicle whose link for ground stations sends to a port of loopback; `speed` is simulated over wall time."""
+    flight = scenario.load("takeoff-hover")
     offboard = UdpLink((LOOPBACK, 0))
     gcs = UdpLink((LOOPBACK, 0), (LOOPBACK, to_port))
     try:
@@ -31,7 +31,8 @@ def flying(system_id: int, to_port: int, name: str = "takeoff-hover") -> Iterato
         )
         stop = threading.Event()
         thread = threading.Thread(
-            target=lambda: drivers.run_realtime_vehicle(core, [offboard, gcs], Tap(), stop=stop.is_set), daemon=True
+            target=lambda: drivers.run_realtime_vehicle(core, [offboard, gcs], Tap(), speed=speed, stop=stop.is_set),
+            daemon=True,
         )
         thread.start()
         try:

@@ -136,7 +136,7 @@ class Chart {
     const second = spec.series.some((each) => each.scale);
     this.uplot = new uPlot(
       {
-        width: 10, height: 10, legend: { show: false }, cursor: { show: false }, padding: [0.5 * rem, second ? 0 : 0.7 * rem, 0, 0],
+        width: 10, height: 10, legend: { show: false }, cursor: { show: false }, padding: [0.5 * rem, second ? 0 : 1.2 * rem, 0, 0],
         scales: {
           x: { time: false, range: () => [this.from, this.from + WINDOW_S] },
           y: { range: (plot, low, high) => this.range(low, high) },
