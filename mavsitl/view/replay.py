@@ -53,16 +53,21 @@ def find_flights(path: Path) -> list[Recorded]:
     Raises `LogError` where there are none, and `RunError` for a damaged run.
     """
     if (path / RUN_FILE).is_file():
-        return [Recorded(flight.title, {1: path / flight.folder}) for flight in load_run(path).flights]
+        flights = load_run(path).flights
+        titles = [flight.title for flight in flights]
+        return [
+            Recorded(title if titles.count(title) == 1 else f"{title} ({flight.folder})", {1: path / flight.folder})
+            for title, flight in zip(titles, flights, strict=True)
+        ]
     found = _flight(path)
     if found is not None:
         return [found]
     if not path.is_dir():
         raise LogError(f"{path}: no such folder; expected that of a run, with {RUN_FILE} or {VEHICLE_LOG} in it")
-    flights = [flight for entry in sorted(path.iterdir()) if entry.is_dir() and (flight := _flight(entry)) is not None]
-    if not flights:
+    below = [flight for entry in sorted(path.iterdir()) if entry.is_dir() and (flight := _flight(entry)) is not None]
+    if not below:
         raise LogError(f"{path}: nothing to replay; expected {RUN_FILE}, {VEHICLE_LOG} or a fleet's vehicle-0 in it")
-    return flights
+    return below
 
 
 def _flight(folder: Path) -> Recorded | None:

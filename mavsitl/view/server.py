@@ -260,10 +260,9 @@ class Page:
         return None
 
     def _is_our_name(self, headers: Headers) -> bool:
-        """Whether the request is for this machine by a name that only it has: no name of a foreign zone leads here.
+        """Whether the request is for an address of loopback, or `localhost`, with our port.
 
-        An address is no name, and a name in the token's case is as good as another: who does not know the token gets
-        nothing.
+        Bound beyond loopback any name will do: who does not know the token is told nothing, whatever he calls us.
         """
         names = headers.get_all("Host")
         if len(names) != 1:

@@ -154,7 +154,6 @@ def rate_hz(vehicles: int) -> tuple[float, float]:
         tab.look((420, 320))  # to draw in software takes the processor from whom it is about
         tab.open(address)
         tab.wait(f"document.querySelectorAll('#vehicles button').length === {vehicles}", PATIENCE_S)
-        tab.wait(badge("in the air"), PATIENCE_S)
         states, moved = tab.value(COUNT)
         return states / COUNTED_S, moved / COUNTED_S / vehicles
 

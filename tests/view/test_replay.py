@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from mavsitl import ends, scenario
 from mavsitl.log.errors import LogError
 from mavsitl.log.ulog import read
-from mavsitl.report.run import RUN_FILE, RunError, new_run, record, write_run
+from mavsitl.report.run import RUN_FILE, RunError, load_run, new_run, record, write_run
 from mavsitl.view.model import COLUMNS, Seen
 from mavsitl.view.replay import Replay, find_flights
 
@@ -54,6 +55,15 @@ def test_it_finds_the_flights_of_a_run_a_folder_and_a_fleet(run: Path, fleet: Pa
     assert list(nine.folders) == [1, 2, 3]
     (nine,) = find_flights(fleet / "formation-spiral")
     assert list(nine.folders) == [1, 2, 3]
+
+
+def test_flights_of_one_title_are_told_apart_by_their_folders(run: Path, tmp_path: Path) -> None:
+    known = load_run(run).flights[0]
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    twice = tuple(msgspec.structs.replace(known, folder=name) for name in ("one", "two"))
+    write_run(tmp_path, new_run("test", "2026-01-01T00:00:00Z", twice))
+    assert [flight.name for flight in find_flights(tmp_path)] == [f"{known.title} (one)", f"{known.title} (two)"]
 
 
 def test_where_there_is_nothing_it_says_what_is_expected(tmp_path: Path) -> None:

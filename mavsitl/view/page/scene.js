@@ -105,6 +105,8 @@ export class Scene {
         this.crafts.set(values.number, craft);
         if (this.view === "all") this.framed = false;
       }
+      const begins = craft.begin(values);
+      if (begins && this.store.rowsOf === values.number) craft.trail.fill(this.store.rows);
       craft.show(values, this.origin(values), seconds, near, values.number === this.store.selected);
     }
     this.moveCamera(seconds);
@@ -333,12 +335,16 @@ class Craft {
     this.trail.dispose();
   }
 
+  /** Whether the vehicle's rows have begun anew: it restarted, or a replay was moved. */
+  begin({ chapter }) {
+    if (chapter === this.chapter) return false;
+    this.chapter = chapter;
+    this.trail.clear();
+    this.placed = false;
+    return true;
+  }
+
   show(values, origin, seconds, near, selected) {
-    if (values.chapter !== this.chapter) {
-      this.chapter = values.chapter;
-      this.trail.clear();
-      this.placed = false;
-    }
     if (!values.position || !values.attitude) return;
     const place = (ned) => new three.Vector3(...toScene(ned.map((each, k) => each + origin[k])));
     const position = place(values.position);
@@ -438,12 +444,24 @@ class Trail {
     this.line.visible = false;
   }
 
-  add(position, time) {
+  /** The way that rows tell. */
+  fill({ time, north, east, down }) {
+    time.forEach((each, k) => {
+      if (north[k] !== null) this.add(new three.Vector3(...toScene([north[k], east[k], down[k]])), each, false);
+    });
+    this.paint();
+  }
+
+  add(position, time, visible = true) {
     const last = this.points.at(-1);
     if (last && last.position.distanceTo(position) < TRAIL_STEP_M) return;
     if (last && (position.distanceTo(last.position) > 5 || time < last.time)) this.points = [];
     this.points.push({ position, time });
     while (this.points.length > TRAIL_POINTS || this.points[0].time < time - TRAIL_S) this.points.shift();
+    if (visible) this.paint();
+  }
+
+  paint() {
     const { position: places, color: colours } = this.line.geometry.attributes;
     const shade = new three.Color();
     this.points.forEach((point, k) => {
