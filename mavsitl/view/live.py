@@ -322,8 +322,7 @@ class Station:
         client.receive(frame.message, sender, now_us)
         known = client.values.get(monitor.CONTROL_LAW)
         if known is not None:
-            names = {number: law for law, number in monitor.LAWS.items()}
-            craft.vehicle.put("law", names.get(int(known), "none"))
+            craft.vehicle.put("law", next((law for law, number in monitor.LAWS.items() if number == known), "none"))
 
     # --- the buttons
 

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mavsitl_ground.controller import Ground
 from mavsitl_vehicle.vehicle import Vehicle
 
-from mavsitl import scenario
+from mavsitl import monitor, scenario
 from mavsitl.codec import encode
 from mavsitl.dialect import mavlink
 from mavsitl.ends import NullRecorder
 from mavsitl.view.live import ACTIONS, FAST, SLOW, STEADY, Station, rate_hz
-from mavsitl.view.model import Seen
+from mavsitl.view.model import FROM_AUTOPILOT, FROM_GROUND, Seen
+from tests.wire.reference import frame_v2
 
 PERIOD_US = 4000
 OFFBOARD, GCS = 0, 1
@@ -245,6 +250,43 @@ def test_who_is_no_autopilot_is_no_vehicle_and_junk_is_nothing() -> None:
     assert station.receive(1, encode(camera, 0, 9, 191), 0) == 1  # a ground of a vehicle that is not known
     station.step(0)
     assert station.model.vehicles == {}
+
+
+HEARD = sorted({*FROM_AUTOPILOT, *FROM_GROUND, *Station._services})
+"""Ids of the messages that anything is made of."""
+
+
+@given(st.data())
+def test_no_content_of_a_message_stops_it(data: st.DataObject) -> None:
+    """Frames that are good but for what stands in them, from a vehicle and from a ground: the page is told JSON."""
+    station = Station(1, with_monitor=True)
+    heartbeat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 1, 6 << 16, 3, 3)
+    station.receive(0, encode(heartbeat, 0, 1, 1), 0)
+    for sequence in range(6):
+        message_class = mavlink.mavlink_map[data.draw(st.sampled_from(HEARD))]
+        size = struct.calcsize(message_class.native_format.decode())
+        payload = data.draw(st.binary(min_size=1, max_size=size))
+        port, component = data.draw(st.sampled_from([(0, 1), (1, monitor.COMPONENT_ID)]))
+        datagram = frame_v2(message_class, payload, sequence=sequence, component_id=component)
+        assert station.receive(port, datagram, sequence * 400_000) == 1
+        station.step(sequence * 400_000)
+    seen = Seen()
+    seen.selected = 1
+    text = msgspec.json.encode(station.model.news(seen))
+    assert b"NaN" not in text
+    msgspec.json.decode(text)
+
+
+def test_a_law_that_is_no_number_is_none() -> None:
+    station = Station(1, with_monitor=True)
+    heartbeat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 1, 6 << 16, 3, 3)
+    station.receive(0, encode(heartbeat, 0, 1, 1), 0)
+    for sequence, value in enumerate((float("nan"), float("inf"), 1e30)):
+        law = mavlink.MAVLink_param_value_message(
+            monitor.CONTROL_LAW.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0
+        )
+        station.receive(1, encode(law, sequence, 1, monitor.COMPONENT_ID), 0)
+        assert station.model.vehicles[1].values["law"] == "none"
 
 
 def test_hostile_text_is_told_as_it_is() -> None:
