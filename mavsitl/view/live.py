@@ -69,7 +69,7 @@ SLOW = (
 )
 """What is asked for: for each picture, at most ten times a second, twice a second."""
 
-SHOWN_PARAMETERS = (*(f"SIM_FAIL_MOT{motor}" for motor in range(1, 5)), "SIM_LINK_DOWN")
+SHOWN_PARAMETERS = (*(f"SIM_FAIL_MOT{motor}" for motor in range(1, 5)), "SIM_LINK_DOWN", "SIM_GUST_TRIG")
 """Of the vehicle, that buttons change. One that has them tells of each change."""
 
 # --- what the buttons do ---------------------------------------------------------------------------------------------

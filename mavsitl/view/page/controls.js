@@ -67,6 +67,7 @@ export class Buttons {
     for (const button of this.place.querySelectorAll("button")) allow(button);
     this.armed.textContent = values?.armed ? "Disarm" : "Arm";
     this.gust.textContent = `Gust ${world.gust_m_s ?? ""} m/s`;
+    allow(this.gust, this.parameter("SIM_GUST_TRIG") !== undefined);
     this.motors.forEach((button, index) => {
       const state = this.parameter(`SIM_FAIL_MOT${index + 1}`);
       allow(button, state !== undefined);
