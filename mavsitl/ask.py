@@ -25,7 +25,9 @@ from mavsitl.services.parameter import (
 )
 from mavsitl.services.statustext import Joiner
 
-__all__ = ["Ask", "CommandTask", "ListTask", "ParameterTask", "Reply", "Task", "failure_kinds", "failure_units"]
+__all__ = [
+    "Ask", "CommandTask", "ListTask", "ParameterTask", "Reply", "Task", "enum_name", "failure_kinds", "failure_units",
+]  # fmt: skip
 
 SYSTEM_ID, COMPONENT_ID = 252, mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 """Its own address, on a system id that none of the known clients takes."""
@@ -133,7 +135,7 @@ class ParameterTask:
         held = "" if failed.value is None else f"; it says {failed.value:g}"
         if failed.error is None:
             return f"does not confirm {failed.name} = {failed.wanted:g}{held}"
-        why = _ERRORS.get(failed.error) or _enum("MAV_PARAM_ERROR", failed.error)
+        why = _ERRORS.get(failed.error) or enum_name("MAV_PARAM_ERROR", failed.error)
         return f"refuses {failed.name} = {failed.wanted:g} ({why}){held}"
 
 
@@ -222,12 +224,12 @@ class CommandTask:
 
     def result(self) -> str:
         known = None if self._client is None else self._client.result
-        return "" if known is None else _enum("MAV_RESULT", known)
+        return "" if known is None else enum_name("MAV_RESULT", known)
 
     def problem(self) -> str:
         if self._client is None or self._client.result == mavlink.MAV_RESULT_ACCEPTED:
             return ""
-        name = _enum("MAV_CMD", self._command)
+        name = enum_name("MAV_CMD", self._command)
         return f"answers {name} with {self.result()}" if self.result() else f"does not acknowledge {name}"
 
 
@@ -341,7 +343,7 @@ def _is_ack_for_us(message: Message) -> bool:
     )
 
 
-def _enum(name: str, value: int) -> str:
+def enum_name(name: str, value: int) -> str:
     """The entry without its enumeration's name before it."""
     entry = mavlink.enums[name].get(value)
     return f"{name} {value}" if entry is None else str(entry.name).removeprefix(f"{name}_")
@@ -350,7 +352,7 @@ def _enum(name: str, value: int) -> str:
 def failure_units() -> dict[str, int]:
     """FAILURE_UNIT by short names: gyro, gps, battery, motor, rc, mavlink, ..."""
     return {
-        _enum("FAILURE_UNIT", value)
+        enum_name("FAILURE_UNIT", value)
         .removeprefix("SENSOR_")
         .removeprefix("SYSTEM_")
         .removesuffix("_SIGNAL")
@@ -361,7 +363,7 @@ def failure_units() -> dict[str, int]:
 
 def failure_kinds() -> dict[str, int]:
     """FAILURE_TYPE by short names: ok, off, stuck, ..."""
-    return {_enum("FAILURE_TYPE", value).lower(): value for value in _entries("FAILURE_TYPE")}
+    return {enum_name("FAILURE_TYPE", value).lower(): value for value in _entries("FAILURE_TYPE")}
 
 
 def _entries(name: str) -> list[int]:

@@ -728,10 +728,12 @@ def run_realtime_ground(
     stop: Callable[[], bool] = lambda: False,
     say: Callable[[str], None] = lambda text: None,
     progress: Progress | None = None,
+    aside: Callable[[int], None] = lambda now_us: None,
 ) -> tuple[int, int]:
     """The ground on the wall clock: it steps as soon as telemetry comes, and at least once a control period.
 
     Its own clock is the wall's less what it was suspended for, which `say` is told: that was no silence of the vehicle.
+    `aside` is told that clock at each turn, when all else is done: what is beside the off-board link.
     Returns the microseconds that passed on the vehicle's clock and on the wall since the first state.
     """
     first: tuple[int, int] | None = None
@@ -764,6 +766,7 @@ def run_realtime_ground(
             link.send(answer)
         tap.tick(now_us, wall_us)
         throttle(ground)
+        aside(now_us)
     return (0, 0) if first is None else (last[0] - first[0], last[1] - first[1])
 
 

@@ -473,23 +473,77 @@ def ground_realtime(
     flight: Flight, address: Address, folder: Path | None, *,
     vehicle_system_id: int | None, wing: str | None,
     report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
-    wish: realtime.Wish = realtime.Wish.ORDINARY,
+    wish: realtime.Wish = realtime.Wish.ORDINARY, monitor: Address | None = None,
 ) -> Outcome:  # fmt: skip
-    """The ground on the wall clock, on any endpoint. Raises as `vehicle_realtime`."""
+    """The ground on the wall clock, on any endpoint. `monitor`: where it tells what it knows, see `mavsitl.monitor`.
+
+    Raises as `vehicle_realtime`.
+    """
     realtime.check(wish)
-    link = open_link(address, port_option="--link udpin:HOST:PORT", host_option="--link udpin:HOST:PORT")
+    with ExitStack() as stack:
+        link = open_link(address, port_option="--link udpin:HOST:PORT", host_option="--link udpin:HOST:PORT")
+        stack.callback(link.close)
+        beside = stack.enter_context(_monitor(monitor))
+        recorder, tap = stack.enter_context(
+            _logs(folder, "ground", flight, lambda error: report(f"logging has ended: {error}"))
+        )
+        build = wings.find(wings.GROUND_GROUP, wing)
+        core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id, **_monitored(build, monitor))
+        beside.core = core
+        watch = _Watch(core)
+        with process.flying(), realtime.claim(wish, report):
+            simulated_us, wall_us = drivers.run_realtime_ground(
+                core, link, tap, stop=stop, say=report, progress=progress, aside=beside
+            )
+        return watch.outcome(simulated_us, tap, wall_us=wall_us)
+
+
+class _Beside:
+    """Moves the datagrams of a ground's monitor link, beside the control loop and never before it is due."""
+
+    LOOK_US = 20_000
+    """Between two looks at the socket."""
+
+    def __init__(self, link: Link | None) -> None:
+        self.core: Any = None
+        self._link = link
+        self._due_us = 0
+
+    def __call__(self, now_us: int) -> None:
+        link = self._link
+        if link is None or now_us < self._due_us:
+            return
+        self._due_us = now_us + self.LOOK_US
+        monitor = self.core.monitor
+        for datagram, source in link.receive(now_us):
+            if monitor.receive(datagram):
+                link.admit(source, now_us)
+        monitor.step(now_us)
+        for datagram in monitor.datagrams():
+            link.send(datagram)
+
+
+@contextmanager
+def _monitor(address: Address | None) -> Iterator[_Beside]:
+    """The monitor link of a ground, where it has one."""
+    if address is None:
+        yield _Beside(None)
+        return
+    link = open_link(address, port_option="--monitor ENDPOINT", host_option="--monitor ENDPOINT")
     try:
-        with _logs(folder, "ground", flight, lambda error: report(f"logging has ended: {error}")) as (recorder, tap):
-            build = wings.find(wings.GROUND_GROUP, wing)
-            core = build(flight, recorder, report=report, vehicle_system_id=vehicle_system_id)
-            watch = _Watch(core)
-            with process.flying(), realtime.claim(wish, report):
-                simulated_us, wall_us = drivers.run_realtime_ground(
-                    core, link, tap, stop=stop, say=report, progress=progress
-                )
-            return watch.outcome(simulated_us, tap, wall_us=wall_us)
+        yield _Beside(link)
     finally:
         link.close()
+
+
+def _monitored(build: Any, monitor: Address | None) -> dict[str, Any]:
+    """The option of a ground wing that shall have a monitor link. Raises `WingError` for one that has none."""
+    if monitor is None:
+        return {}
+    parameters = inspect.signature(build).parameters
+    if "options" not in parameters and "monitored" not in parameters:
+        raise wings.WingError(f"{build.__module__} tells nothing beside the off-board link: it takes no --monitor")
+    return {"monitored": True}
 
 
 def in_memory(
@@ -662,8 +716,11 @@ def ground_fleet(
     flight: Flight, addresses: Sequence[Address], folder: Path | None, *,
     count: int, first_system_id: int, wing: str | None,
     report: Callable[[str], None], stop: Callable[[], bool], wish: realtime.Wish = realtime.Wish.ORDINARY,
+    monitor: Address | None = None,
 ) -> FleetOutcome:  # fmt: skip
-    """`count` controllers on the wall clock, each on its endpoint or all on one. Raises as `ground_realtime`."""
+    """`count` controllers on the wall clock, each on its endpoint or all on one. `monitor` and raises as
+    `ground_realtime`.
+    """
     realtime.check(wish)
     opened: list[Link] = []
     with ExitStack() as stack:
@@ -672,18 +729,24 @@ def ground_fleet(
             option = "--link udpin:HOST:PORT or --instance I"
             opened.append(open_link(address, port_option=option, host_option="--link udpin:HOST:PORT"))
 
+        beside = stack.enter_context(_monitor(monitor))
+
         def failed(error: LogError) -> None:
             report(f"logging has ended: {error}")
 
         folders = [_fleet_folder(folder, first_system_id - 1 + j) for j in range(count)]
         logs = [stack.enter_context(_logs(each, "ground", flight, failed)) for each in folders]
+        build = wings.find(wings.GROUND_GROUP, wing)
         core = _many(
-            wings.find(wings.GROUND_GROUP, wing), flight, [recorder for recorder, _ in logs], count=count,
-            report=report, vehicle_system_id=first_system_id, one_link=len(addresses) < count,
+            build, flight, [recorder for recorder, _ in logs], count=count, report=report,
+            vehicle_system_id=first_system_id, one_link=len(addresses) < count, **_monitored(build, monitor),
         )  # fmt: skip
+        beside.core = core
         taps = {} if folder is None else {j: tap for j, (_, tap) in enumerate(logs)}
         with process.flying(), realtime.claim(wish, report):
-            simulated_us, wall_us = fleet.run_realtime_formation(core, opened, taps, stop=stop, say=report)
+            simulated_us, wall_us = fleet.run_realtime_formation(
+                core, opened, taps, stop=stop, say=report, aside=beside
+            )
         return _fleet_outcome(core, simulated_us, wall_us, core.flown())
 
 

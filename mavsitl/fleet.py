@@ -184,11 +184,13 @@ def run_realtime_formation(
     *,
     stop: Callable[[], bool] = lambda: False,
     say: Callable[[str], None] = lambda text: None,
+    aside: Callable[[int], None] = lambda now_us: None,
 ) -> tuple[int, int]:
     """The controllers on the wall clock: each steps as soon as its telemetry comes, and once a control period.
 
     Their clock is the wall's less what the process was suspended for. `links` by port, `taps` by controller. Returns
-    the microseconds that passed on the clock and on the wall.
+    the microseconds that passed on the clock and on the wall. `aside` is told the clock at each turn, when all else is
+    done: what is beside the off-board links.
     """
     period_us = formation.period_us
     start_us = woken_us = monotonic_us()
@@ -226,6 +228,7 @@ def run_realtime_formation(
                     links[port].send(datagram)
             for tap in logs[turns % TAPS :: TAPS]:
                 tap.tick(now_us, wall_us)
+            aside(now_us)
             turns += 1
     return now_us, monotonic_us() - start_us
 

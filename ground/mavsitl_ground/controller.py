@@ -9,6 +9,7 @@ from collections.abc import Callable
 from math import acos, cos, degrees, exp, radians, sqrt
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from mavsitl.codec import Frame, packer
@@ -28,6 +29,8 @@ from mavsitl.services.statustext import Joiner
 from mavsitl_ground import cycle
 from mavsitl_ground.cycle import Demand
 from mavsitl_ground.demand import SENDS, Send
+from mavsitl_ground.laws import Law, carry_over
+from mavsitl_ground.monitor import Monitor
 from mavsitl_ground.observer import Observer
 from mavsitl_ground.record import block
 from mavsitl_ground.reference import reference_for
@@ -69,23 +72,75 @@ class Controller:
         Raises `ScenarioError` where the airframe does not say what the command level needs.
         """
         settings = flight.scenario.controller
+        self._flight = flight
         self.reference = reference_for(flight.scenario.reference, offset_nwu_m)
-        self._memory = _at_rest(flight)
-        self._at_rest = self._memory.copy()
-        self.learns = settings.level != "attitude" and settings.law == "pidnn"
-        """A PIDNN is here, not aboard or nowhere: rows of the log have its weights."""
-        if settings.level == "attitude":
-            function = cycle.attitude_cycle
-        else:
-            function = cycle.net_cycle if self.learns else cycle.pid_cycle
-        # Compiles, or reads the cache, before the clock runs.
-        state, row = Observer(settings.telemetry).state, np.zeros(cycle.COLUMNS)
-        self._cycle = direct(function, self._memory, state, self.reference.now, row, 0, 0, 0, 0, 0)
-        self.reset()
+        self.law: Law | None = None if settings.level == "attitude" else settings.law
+        """The attitude law that is here; None: it is aboard, or there is none."""
+        self._cycles: dict[Law | None, Callable[..., Demand]] = {}
+        self._take_seat(_at_rest(flight))
+
+    def _take_seat(self, memory: Record) -> None:
+        """At rest, with the memory of the law, which is compiled, or read from the cache, where it flies first."""
+        self._memory = memory
+        self._at_rest = memory.copy()
+        if self.law not in self._cycles:
+            state, row = Observer(self._flight.scenario.controller.telemetry).state, np.zeros(cycle.COLUMNS)
+            self._cycles[self.law] = direct(
+                _CYCLES[self.law], memory, state, self.reference.now, row, 0, 0, 0, 0, 0
+            )  # fmt: skip
+            self.reset()
+        self._cycle = self._cycles[self.law]
 
     def reset(self) -> None:
         """At rest at the start of a flight: integrators empty, nets as the identical PID, rotors at hover."""
         self._memory[:] = self._at_rest
+
+    @property
+    def learns(self) -> bool:
+        """A PIDNN is here, not aboard or nowhere: rows of the log have its weights."""
+        return self.law == "pidnn"
+
+    @property
+    def desired_rad(self) -> Vector:
+        """phi_d, theta_d, psi_d."""
+        return _numbers(self._memory[0]["desired"])
+
+    @property
+    def control(self) -> tuple[float, Vector]:
+        """U_1 in N and W_1..W_3 in m/s^2."""
+        return float(self._memory[0]["thrust_n"]), _numbers(self._memory[0]["wind"])
+
+    @property
+    def weights(self) -> tuple[list[float], list[float]] | None:
+        """(9,) the nets' output weights, net after net, and what they start from; None: no nets here."""
+        if not self.learns:
+            return None
+        law = self._memory[0]["law"]
+        return law["weights"][:, :, 0].T.ravel().tolist(), law["initial"].T.ravel().tolist()
+
+    @property
+    def gains(self) -> list[float] | None:
+        """(9,) of the PID, axis after axis; None: no PID here."""
+        return None if self.law != "pid" else self._memory[0]["law"]["gains"].T.ravel().tolist()
+
+    def prepare(self) -> None:
+        """Before the flight, where the law may be changed in it: both laws are compiled."""
+        if self.law is not None:
+            for law in (_OTHER[self.law], self.law):
+                self.fly_by(law)
+            self.reset()
+
+    def fly_by(self, law: Law) -> None:
+        """Go on with this attitude law. Raises `ValueError` where the attitude is not controlled here."""
+        if self.law is None:
+            raise ValueError("the attitude is controlled aboard: there is no law to change")
+        if law == self.law:
+            return
+        before, scenario = self._memory, self._flight.scenario
+        scenario = msgspec.structs.replace(scenario, controller=msgspec.structs.replace(scenario.controller, law=law))
+        self.law = law
+        self._take_seat(_at_rest(msgspec.structs.replace(self._flight, scenario=scenario)))
+        carry_over(before, self._memory)
 
     def update(
         self, time_s: float, state: Observer, row: Floats, frames: int, lost: int, rejected: int, age_us: int
@@ -97,6 +152,10 @@ class Controller:
             self._memory, state.state, self.reference.now, row,
             state.stamp_us, frames, lost, rejected, age_us,
         )  # fmt: skip
+
+
+_OTHER: dict[Law, Law] = {"pid": "pidnn", "pidnn": "pid"}
+_CYCLES = {None: cycle.attitude_cycle, "pid": cycle.pid_cycle, "pidnn": cycle.net_cycle}
 
 
 def _at_rest(flight: Flight) -> Record:
@@ -185,10 +244,12 @@ class Ground:
         report: Callable[[str], None] = lambda text: None,
         vehicle_system_id: int | None = None,
         offset_nwu_m: Vector = (0.0, 0.0, 0.0),
+        monitored: bool = False,
     ) -> None:
         """`report` gets a line at each step of the handshake and each STATUSTEXT of the vehicle.
 
-        `offset_nwu_m`: the vehicle's place in a formation, by which the reference is moved.
+        `offset_nwu_m`: the vehicle's place in a formation, by which the reference is moved. `monitored`: there is a
+        `monitor`, and the law may be changed by it.
         """
         scenario = flight.scenario
         self.period_us = scenario.rates.control_period_us
@@ -227,7 +288,13 @@ class Ground:
         self._down_since_us: int | None = None
         self._has_flown = False
         self._heartbeat_us = -HEARTBEAT_INTERVAL_US
-        self._rows = block(recorder, flight, with_weights=self._controller.learns, own=own)
+        self.monitor: Monitor | None = None
+        if monitored:
+            self._controller.prepare()
+            self.monitor = Monitor(self)
+        weights = self._controller.learns or (monitored and self.law is not None)
+        self._rows = block(recorder, flight, with_weights=weights, own=own)
+        self._log_gains()
         self._now_us = 0
         self._due_us = NOW
         """Until then, and until something comes but the state, nothing is to be done but control."""
@@ -279,6 +346,63 @@ class Ground:
     @property
     def counters(self) -> Any:
         return self._node.counters
+
+    # What the monitor tells.
+
+    @property
+    def vehicle_system_id(self) -> int | None:
+        """None before one is found."""
+        target = self._handshake.target
+        return None if target is None else target[0]
+
+    @property
+    def phase_number(self) -> int:
+        return self._handshake.phase.value
+
+    @property
+    def reference_nwu(self) -> tuple[Vector, Vector, float]:
+        """Position m, velocity m/s and yaw rad, as of the last period."""
+        now = self._controller.reference.now[0]
+        return _numbers(now["position"]), _numbers(now["velocity"]), float(now["yaw"][0])
+
+    @property
+    def desired_rad(self) -> Vector:
+        """phi_d, theta_d, psi_d."""
+        return self._controller.desired_rad
+
+    @property
+    def control(self) -> tuple[float, Vector]:
+        """U_1 in N and W_1..W_3 in m/s^2."""
+        return self._controller.control
+
+    @property
+    def weights(self) -> tuple[list[float], list[float]] | None:
+        """(9,) the nets' output weights, net after net, and what they start from; None: no nets here."""
+        return self._controller.weights
+
+    def link(self, now_us: int) -> tuple[int, int, int, int]:
+        """Frames received, lost, rejected, and the age of the state in us."""
+        counters, source = self._node.counters, self._node.sources.get(self._handshake.target or (0, 0))
+        lost = 0 if source is None else source.lost
+        return counters.frames, lost, counters.rejected, self._observer.age_us(now_us) or 0
+
+    @property
+    def law(self) -> Law | None:
+        """Of the attitude; None: it is controlled aboard."""
+        return self._controller.law
+
+    def fly_by(self, law: Law) -> None:
+        """Change the attitude law. Raises as `Controller.fly_by`."""
+        if law != self._controller.law:
+            self._controller.fly_by(law)
+            self._log_gains()
+            self._report(f"the attitude is flown by {law.upper()}")
+
+    def _log_gains(self) -> None:
+        """Where the log has weights and no net is seated, they are the PID's gains."""
+        gains = self._controller.gains
+        if gains is not None:
+            self._rows.preset(slice(cycle.WEIGHTS, cycle.COLUMNS), np.array(gains))
 
     def receive(self, port: int, datagram: bytes) -> int:
         """One datagram from the link; the number of valid frames in it."""
@@ -412,6 +536,11 @@ class Ground:
     def _send_command(self, command: int, confirmation: int, params: tuple[float, ...]) -> None:
         system_id, component_id = self._handshake.target or (0, 0)
         self._node.send(COMMAND_LONG, system_id, component_id, command, confirmation, *params)
+
+
+def _numbers(column: Any) -> Vector:
+    x, y, z = column[:, 0].tolist()
+    return x, y, z
 
 
 def build(flight: Flight, recorder: Any, *, count: int | None = None, **options: Any) -> Any:

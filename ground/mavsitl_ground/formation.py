@@ -14,6 +14,7 @@ from mavsitl.log.ulog import Recorder
 from mavsitl.routing import by_sender
 from mavsitl.scenario import Flight
 from mavsitl_ground.controller import Ground
+from mavsitl_ground.monitor import Monitors
 
 
 @dataclass
@@ -58,15 +59,17 @@ class Formation:
         report: Callable[[str], None] = lambda text: None,
         vehicle_system_id: int = 1,
         one_link: bool = False,
+        monitored: bool = False,
     ) -> None:
         """`vehicle_system_id`: of the first vehicle, the others follow. `report` gets the lines of all, named."""
         self.grounds = [
             Ground(
                 flight, recorders[j], report=_named(report, vehicle_system_id + j),
-                vehicle_system_id=vehicle_system_id + j, offset_nwu_m=place,
+                vehicle_system_id=vehicle_system_id + j, offset_nwu_m=place, monitored=monitored,
             )
             for j, place in enumerate(formation.places(flight.scenario.fleet, count))
         ]  # fmt: skip
+        self.monitor = Monitors([each.monitor for each in self.grounds if each.monitor]) if monitored else None
         self.period_us = self.grounds[0].period_us
         self._first_id = vehicle_system_id
         self._one_link = one_link

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 from mavsitl import __version__, process
-from mavsitl.cli import ask, bench, check, completion, fly, ground, lists, log, report, sweep, tune, vehicle
+from mavsitl.cli import ask, bench, check, completion, fly, ground, lists, log, report, sweep, tune, vehicle, view
 from mavsitl.cli.common import EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE, Interrupted
 from mavsitl.cli.parser import ParseError, Parser
 from mavsitl.errors import MavsitlError
@@ -89,7 +89,7 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(title="commands", prog=parser.prog, dest="command", metavar="COMMAND")
     for add in (
         fly.add, vehicle.add, ground.add, check.add, ask.add_link, ask.add_inject, ask.add_param, sweep.add, tune.add,
-        bench.add, report.add, log.add, lists.add_scenarios, lists.add_chaos, completion.add,
+        bench.add, view.add, report.add, log.add, lists.add_scenarios, lists.add_chaos, completion.add,
     ):  # fmt: skip
         add(commands)
     return parser

@@ -48,6 +48,7 @@ examples:
   mavsitl ground hover-wind --link udpin:0.0.0.0:14540
   mavsitl ground spiral-calm --link udpout:192.0.2.9:14580 --system 3
   mavsitl ground hover-wind --controller my.py:MyController
+  mavsitl ground --monitor udpout:127.0.0.1:14560    tell mavsitl view what only the ground knows
   mavsitl ground formation-spiral --count 9          for nine vehicles, at udpin:127.0.0.1:14540 to 14548
 """
 
@@ -84,6 +85,11 @@ def add(commands: Any) -> None:
         metavar="HOST:PORT",
         help="lock-step only: the vehicle's off-board port (default: 127.0.0.1:14580)",
     )
+    group.add_argument(
+        "--monitor", metavar="ENDPOINT",
+        help="tell reference, weights, link and more there, and change the law by CTRL_LAW (default: none; "
+        "mavsitl view listens for udpout:127.0.0.1:14560)",
+    )  # fmt: skip
     add_end_options(parser)
     parser.set_defaults(run=_ground)
 
@@ -96,14 +102,17 @@ def _ground(options: argparse.Namespace) -> int:
 
     flight = load(options.scenario, settings_of(options))
     address = parse_address(options.link) if options.link else ends.ground_address(options.instance)
+    monitor = parse_address(options.monitor) if options.monitor else None
     check_effect(options, "ground", ("--seed",))
     check_lockstep(
-        options, real_time_only=("--realtime", "--best-effort"), lockstep_only=("--deadline", "--cpu", "--vehicle")
+        options,
+        real_time_only=("--realtime", "--best-effort", "--monitor"),
+        lockstep_only=("--deadline", "--cpu", "--vehicle"),
     )
     wish = wish_for_real_time(options)
     first_id = options.system if options.system is not None else options.instance + 1
     if count := check_fleet(options, first_id):
-        return _ground_fleet(options, flight, address, first_id, count, wish)
+        return _ground_fleet(options, flight, address, first_id, count, wish, monitor)
     status = Status(options.status == "json", options.run_dir)
     if options.lockstep:
         if not address.kind.startswith("udp"):
@@ -120,14 +129,20 @@ def _ground(options: argparse.Namespace) -> int:
         outcome = ends.ground_realtime(
             flight, address, options.run_dir,
             vehicle_system_id=options.system, wing=options.wing, report=status.say, stop=status.stop, progress=None,
-            wish=wish,
+            wish=wish, monitor=monitor,
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED
 
 
 def _ground_fleet(
-    options: argparse.Namespace, flight: Flight, first: Address, system_id: int, count: int, wish: Wish
+    options: argparse.Namespace,
+    flight: Flight,
+    first: Address,
+    system_id: int,
+    count: int,
+    wish: Wish,
+    monitor: Address | None,
 ) -> int:
     """`first`: where the first vehicle, or all of them, are heard."""
     from mavsitl import ends
@@ -148,7 +163,7 @@ def _ground_fleet(
     )
     outcome = ends.ground_fleet(
         flight, addresses, options.run_dir, count=count, first_system_id=system_id, wing=options.wing,
-        report=status.say, stop=status.stop, wish=wish,
+        report=status.say, stop=status.stop, wish=wish, monitor=monitor,
     )  # fmt: skip
     status.end_fleet(outcome)
     return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED

@@ -48,6 +48,11 @@ class Block:
         stamps.append(timestamp_us)
         return row
 
+    def preset(self, columns: slice, values: Array) -> None:
+        """From the next row on these columns hold these values, where who fills a row leaves them alone."""
+        self.drain()
+        self._values[:, columns] = values
+
     def drain(self) -> None:
         """Hand over what was gathered."""
         stamps, self._stamps = self._stamps, []
