@@ -23,6 +23,9 @@ SPLIT = (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCA
 ODOMETRY = (mavlink.MAVLINK_MSG_ID_ODOMETRY,)
 Source: TypeAlias = Literal["any", "odometry", "split"]
 NO_OFFSET_US = 1 << 62
+OFFSET_US = 500_000
+"""How fast a state can come is known from as long a time, up to twice that: the clocks drift, and the vehicle's stands
+still where its machine is too slow or `--speed` is below 1."""
 FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
 RESTART_US = 1_000_000
 """The vehicle's clock goes back by more than this when it has restarted; by less, messages were overtaken."""
@@ -154,7 +157,8 @@ class Observer:
         self._position_us = -1
         self._pairs = 0
         """Attitudes in a row that had a position of their own stamp; after two the next is waited for too."""
-        self._offset_us = NO_OFFSET_US
+        self._offset_us = self._older_offset_us = NO_OFFSET_US
+        self._offset_end_us = 0
         self._fresh = False
         self.state["true_wind"] = nan
 
@@ -211,23 +215,27 @@ class Observer:
     def age_us(self, now_us: int) -> int | None:
         """How old the newest state is at `now_us` of the ground's clock, beyond the fastest transport; None before any.
 
-        The clocks' offset is the least difference seen between coming and stamp: the transport's constant part is not
-        in the age, a drift of the clocks is.
+        The clocks' offset is the least difference between taking and stamp, of the states taken in the last second: the
+        transport's constant part is not in the age, nor is what the clocks have drifted before.
         """
         if self.stamp_us < 0:
             return None
         offset_us = now_us - self.stamp_us
-        if offset_us < self._offset_us:
-            self._offset_us = offset_us
-        return offset_us - self._offset_us
+        return max(offset_us - min(self._offset_us, self._older_offset_us, offset_us), 0)
 
     def take(self, now_us: int) -> int | None:
-        """The age of a fresh state that is not too old, as of `age_us`: it is fresh no more. None: there is none."""
-        age_us = self.age_us(now_us) if self.fresh else None
-        if age_us is None or age_us > self._max_age_us:
+        """The age of a fresh state, as of `age_us`: it is fresh no more. None: there is none, or it is too old."""
+        if not self.fresh:
             return None
         self._fresh = False
-        return age_us
+        offset_us = now_us - self.stamp_us
+        if now_us >= self._offset_end_us:
+            self._offset_end_us = now_us + OFFSET_US
+            self._older_offset_us, self._offset_us = self._offset_us, offset_us
+        elif offset_us < self._offset_us:
+            self._offset_us = offset_us
+        age_us = offset_us - min(self._offset_us, self._older_offset_us)
+        return age_us if age_us <= self._max_age_us else None
 
     def receive(self, frame: Frame) -> None:
         """A frame of the vehicle; messages without one of the `handlers` are ignored."""

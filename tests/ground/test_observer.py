@@ -224,14 +224,40 @@ def test_age_and_validity_are_by_the_ground_s_clock() -> None:
     assert observer.take(7_000_000) is None
     observer.receive(odometry(4000))
     assert observer.age_us(7_000_000) == 0  # the fastest way seen so far
-    assert observer.age_us(7_500_000) == 500_000
-    assert observer.take(7_500_001) is None
-    assert observer.take(7_500_000) == 500_000
-    assert observer.take(7_500_000) is None  # once
-    observer.receive(odometry(504_000))
-    assert observer.take(7_500_300) == 300
+    assert observer.take(7_000_000) == 0
+    assert observer.take(7_000_000) is None  # once
+    assert observer.age_us(7_400_000) == 400_000
+    observer.receive(odometry(8000))
+    assert observer.take(7_504_000) == 500_000
+    observer.receive(odometry(508_000))
+    assert observer.take(7_504_300) == 300
     observer.reset()
     assert observer.age_us(7_500_000) is None
+
+
+def test_a_state_that_comes_too_late_is_not_flown_by_however_long_it_is_the_newest() -> None:
+    observer = Observer(max_age_us=500_000)
+    observer.receive(odometry(4000))
+    assert observer.take(7_000_000) == 0
+    observer.receive(odometry(8000))
+    for now_us in range(7_600_000, 12_000_000, 4000):
+        assert observer.take(now_us) is None
+        assert observer.age_us(now_us) == now_us - 7_004_000
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 2.0])
+def test_a_vehicle_whose_clock_falls_behind_is_flown_all_the_same(speed: float) -> None:
+    """In real time a vehicle without its processor gives up time: its clock is that much later for ever."""
+    observer = Observer(max_age_us=500_000)
+    late_us, taken = 0, []
+    for number in range(2500):
+        if number == 1000:
+            late_us = 3_000_000  # it was suspended
+        now_us = 1_000_000 + number * 4000 + late_us
+        observer.receive(odometry(4000 + round(number * 4000 * speed)))
+        taken.append(observer.take(now_us) is not None)
+    assert all(taken[:1000])
+    assert all(taken[1000 + 250 :])  # a second after
 
 
 def test_true_wind_is_turned_and_forgotten() -> None:
