@@ -118,7 +118,7 @@ class Craft:
 
     def _state(self) -> State:
         status, land = self._recording.newest(topics.VEHICLE_STATUS), self._recording.newest(topics.LAND_DETECTED)
-        armed, nav_state, failsafe = status or (topics.DISARMED, -1, 0)
+        armed, nav_state, failsafe, *_ = status or (topics.DISARMED, -1, 0)
         return State.of(
             self.time_s, self.core.truth, mode=_mode(int(nav_state)), armed=armed == topics.ARMED,
             landed=bool(land[0]) if land else True, failsafe=bool(failsafe),

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mavsitl import __version__
 from mavsitl.ends import WIRE_LOG, End
 from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
 from mavsitl.log.tlog import TlogWriter
 from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS, Topic
-from mavsitl.log.ulog import MemoryRecorder, Rows, UlogWriter
+from mavsitl.log.ulog import MemoryRecorder, Rows, UlogWriter, information
 from mavsitl.scenario import Flight
 
 __all__ = ["LOG_NAMES", "Logs", "Recording"]
@@ -73,6 +72,16 @@ class Recording:
         if self._file is not None:
             self._file.message(timestamp_us, level, text)
 
+    def begin(self, parameters: Mapping[str, float], defaults: Mapping[str, float]) -> None:
+        self.memory.begin(parameters, defaults)
+        if self._file is not None:
+            self._file.begin(parameters, defaults)
+
+    def parameter(self, name: str, value: float) -> None:
+        self.memory.parameter(name, value)
+        if self._file is not None:
+            self._file.parameter(name, value)
+
     def attach(self, drain: Callable[[], None]) -> None:
         self.memory.attach(drain)
         if self._file is not None:
@@ -100,9 +109,8 @@ class Logs:
 
     def _ulog(self, end: End, flight: Flight) -> UlogWriter:
         name, topics = (VEHICLE_LOG, VEHICLE_TOPICS) if end == "vehicle" else (GROUND_LOG, GROUND_TOPICS)
-        info = {"sys_name": "mavsitl", "ver_sw": __version__, "scenario": flight.name}
-        parameters = flight.airframe.parameters | flight.scenario.parameters
-        return UlogWriter(self.folder / name, info, parameters, topics=topics)
+        parameters = {} if end == "vehicle" else flight.airframe.parameters | flight.scenario.parameters
+        return UlogWriter(self.folder / name, information(flight, None), parameters, topics=topics)
 
     def flush(self) -> None:
         for each in (self.vehicle, self.ground, self.wire):
