@@ -18,9 +18,22 @@ from mavsitl.log.errors import LogError
 from mavsitl.scenario import ScenarioError
 
 
+def below(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    found = (each.choices for each in parser._actions if isinstance(each, argparse._SubParsersAction))
+    return dict(next(found, {}))
+
+
 def parsers() -> dict[str, argparse.ArgumentParser]:
-    commands = next(each for each in cli.build_parser()._actions if isinstance(each, argparse._SubParsersAction))
-    return dict(commands.choices)
+    return below(cli.build_parser())
+
+
+def leaves() -> dict[str, argparse.ArgumentParser]:
+    """Those that do something: where a command has commands of its own, these, as ``log info``."""
+    found = {}
+    for name, parser in parsers().items():
+        inner = {f"{name} {each}": one for each, one in below(parser).items()}
+        found.update(inner or {name: parser})
+    return found
 
 
 def examples(parser: argparse.ArgumentParser) -> list[str]:
@@ -70,13 +83,13 @@ def test_exit_codes_are_the_errors_own() -> None:
 # --- JSON -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", parsers())
+@pytest.mark.parametrize("command", leaves())
 def test_every_command_speaks_json(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Each has the option, and says as JSON what it cannot parse: the last line of stdout, whatever else there is."""
-    assert any("--json" in each.option_strings for each in parsers()[command]._actions)
-    needed = [each for each in parsers()[command]._actions if not each.option_strings and each.required]
+    assert any("--json" in each.option_strings for each in leaves()[command]._actions)
+    needed = [each for each in leaves()[command]._actions if not each.option_strings and each.required]
     given = [next(iter(each.choices)) if each.choices else "something" for each in needed]
-    assert main([command, "--json", "--xyz", *given]) == 2
+    assert main([*command.split(), "--json", "--xyz", *given]) == 2
     said = capsys.readouterr()
     assert json.loads(said.out) == {
         "event": "error", "command": f"mavsitl {command}", "error": "--xyz: no such option",
