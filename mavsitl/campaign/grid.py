@@ -25,8 +25,9 @@ Labels: TypeAlias = dict[str, Any]
 """What tells the cases of a campaign apart, by the scenario's dotted keys; values as in the scenario's file."""
 
 NOT_FLYING = (
-    "report/", "link/", "campaign/", "tune/", "score/",
-    "ask.", "check.", "cli/", "clock.", "ends.", "herald.", "keep.", "pair.", "testing.", "__main__",
+    "report/", "link/", "campaign/", "tune/", "score/", "cli/", "testing/", "view/",
+    *(f"log/{name}." for name in ("content", "convert", "diff", "endings", "info", "mcap", "rejoin")),
+    "ask.", "check.", "clock.", "ends.", "herald.", "keep.", "monitor.", "pair.", "__main__",
 )  # fmt: skip
 DECIDING = (
     "link/impaired.py", "link/framing.py", "link/settings.py", "campaign/fly.py", "campaign/sums.py",

@@ -13,7 +13,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +25,6 @@ from tests.cli.containerfile import ROOT, included, parse
 
 COMPOSE: dict[str, Any] = YAML(typ="safe").load((ROOT / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
-HAS_VIEW = find_spec("mavsitl.view") is not None
-"""Goes, with what asks for it, when `mavsitl view` and `ground --monitor` are merged."""
-
-RUN = tuple(name for name in SERVICES if name != "view" or HAS_VIEW)
 INSTRUCTIONS = parse((ROOT / "Containerfile").read_text())
 
 
@@ -38,11 +33,7 @@ def last(word: str) -> list[str]:
 
 
 def words(service: str) -> list[str]:
-    found = shlex.split(SERVICES[service]["command"])
-    if service == "ground" and not HAS_VIEW:
-        at = found.index("--monitor")
-        del found[at : at + 2]
-    return found
+    return shlex.split(SERVICES[service]["command"])
 
 
 # --- what they say --------------------------------------------------------------------------------
@@ -56,7 +47,7 @@ def test_compose_is_as_its_specification_says() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("service", RUN)
+@pytest.mark.parametrize("service", SERVICES)
 def test_each_service_s_command_parses(service: str) -> None:
     assert callable(cli.build_parser().parse_args(words(service)).run)
 
@@ -169,7 +160,7 @@ def test_the_services_fly_on_networks_of_their_own(networks: Networks, tmp_path:
     processes: dict[str, subprocess.Popen[str]] = {}
     said: dict[str, str] = {}
     try:
-        for service in RUN:  # in the order of depends_on
+        for service in SERVICES:  # in the order of depends_on
             processes[service] = networks.start(service, *(("--duration", "3") if service == "ground" else ()))
         ground = processes["ground"]
         assert ground.stdout is not None
