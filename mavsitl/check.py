@@ -19,6 +19,7 @@ from mavsitl.codec import SIGNATURE_BYTES, Counters, Frame, Message, parse
 from mavsitl.dialect import mavlink
 from mavsitl.link.base import Source
 from mavsitl.node import Node, SourceStatistics
+from mavsitl.px4_modes import CUSTOM_MODES
 
 __all__ = [
     "Answer",
@@ -54,27 +55,14 @@ HEARTBEAT_MISSED_US = 1_500_000
 
 AUTOPILOT_VERSION: int = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
 
-PX4_MODES = {
-    (1, 0): "MANUAL",
-    (2, 0): "ALTCTL",
-    (3, 0): "POSCTL",
-    (3, 1): "ORBIT",
+PX4_MODES = CUSTOM_MODES | {
     (3, 2): "POSCTL.SLOW",
     (4, 1): "AUTO.READY",
-    (4, 2): "AUTO.TAKEOFF",
-    (4, 3): "AUTO.LOITER",
-    (4, 4): "AUTO.MISSION",
-    (4, 5): "AUTO.RTL",
-    (4, 6): "AUTO.LAND",
     (4, 8): "AUTO.FOLLOW_TARGET",
     (4, 9): "AUTO.PRECLAND",
     (4, 10): "AUTO.VTOL_TAKEOFF",
-    (5, 0): "ACRO",
-    (6, 0): "OFFBOARD",
-    (7, 0): "STABILIZED",
     (8, 0): "RATTITUDE",
     (9, 0): "SIMPLE",
-    (10, 0): "TERMINATION",
 }
 """PX4's main and sub mode in HEARTBEAT.custom_mode (px4_custom_mode.h) by mavros's names."""
 

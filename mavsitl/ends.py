@@ -196,22 +196,17 @@ def _logs(
         yield NullRecorder(), Tap()
         return
     # Here, for they load numpy: a vehicle is heard before that.
-    from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
-    from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS
-    from mavsitl.log.ulog import UlogWriter, information
+    from mavsitl.log.flight import ENDS, open_ulog
 
-    name, topics = (VEHICLE_LOG, VEHICLE_TOPICS) if end == "vehicle" else (GROUND_LOG, GROUND_TOPICS)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LogError(f"{folder}: no logs can be written there: {error.strerror or error}") from error
     if failed is not None:
-        _keep_older(folder / name)
+        _keep_older(folder / ENDS[end][0])
         if end == "vehicle":
             _keep_older(folder / WIRE_LOG)
-    info = information(flight, boot_us)
-    parameters = {} if end == "vehicle" else flight.airframe.parameters | flight.scenario.parameters
-    with UlogWriter(folder / name, info, parameters, topics=topics, failed=failed) as writer:
+    with open_ulog(folder, end, flight, failed, boot_us) as writer:
         tap = Tap(TlogWriter(folder / WIRE_LOG, failed) if end == "vehicle" else None, flush=writer.flush)
         try:
             yield writer, tap

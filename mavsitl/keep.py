@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
-from typing import Protocol
+from typing import Any, Protocol
 
 __all__ = ["INTERVAL_US", "Document", "Keeper", "Keeping", "Work", "carry_out", "replace_file"]
 
@@ -150,3 +150,10 @@ def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
                 os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def replace_json(path: Path, value: Any) -> None:
+    """As `replace_file`, with a struct, a dictionary or a list as indented JSON."""
+    import msgspec
+
+    replace_file(path, msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["MODES", "NAV_STATES", "Numbers"]
+__all__ = ["CUSTOM_MODES", "MODES", "NAV_STATES", "Numbers"]
 
 
 class Numbers(NamedTuple):
@@ -37,3 +37,6 @@ MODES = {
 """By the names of mavros. PX4 shows AUTO.DESCEND by AUTO.LAND's main and sub mode; nobody can ask for it."""
 
 NAV_STATES = {numbers.nav_state: name for name, numbers in MODES.items()}
+
+CUSTOM_MODES = {(numbers.main_mode, numbers.sub_mode): name for name, numbers in MODES.items()}
+"""What a HEARTBEAT's main and sub mode say: of two modes that share them, the one that can be asked for."""

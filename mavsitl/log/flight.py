@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from math import inf
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -15,14 +15,31 @@ from mavsitl import frames
 from mavsitl.dialect import mavlink
 from mavsitl.errors import MavsitlError
 from mavsitl.log import topics
+from mavsitl.log.errors import Failed
 from mavsitl.log.topics import Topic
-from mavsitl.log.ulog import MemoryRecorder, read
+from mavsitl.log.ulog import MemoryRecorder, UlogWriter, information, read
+from mavsitl.scenario import Flight
 
 Array: TypeAlias = npt.NDArray[np.float64]
 Tables: TypeAlias = Mapping[str, Mapping[str, npt.NDArray[Any]]]
 
 VEHICLE_LOG = "vehicle.ulg"
 GROUND_LOG = "ground.ulg"
+ENDS = {"vehicle": (VEHICLE_LOG, topics.VEHICLE_TOPICS), "ground": (GROUND_LOG, topics.GROUND_TOPICS)}
+"""Of each end its ULog and what may be in it."""
+
+
+def open_ulog(
+    folder: Path, end: Literal["vehicle", "ground"], flight: Flight, failed: Failed | None = None,
+    boot_us: int | None = None,
+) -> UlogWriter:  # fmt: skip
+    """An end's ULog in a folder that is there. The vehicle itself says which parameters it has.
+
+    `failed`: of `UlogWriter`; `boot_us`: of `information`.
+    """
+    name, wanted = ENDS[end]
+    parameters = {} if end == "vehicle" else flight.airframe.parameters | flight.scenario.parameters
+    return UlogWriter(folder / name, information(flight, boot_us), parameters, topics=wanted, failed=failed)
 
 
 class FlightError(MavsitlError, ValueError):

@@ -10,7 +10,7 @@ import msgspec
 
 import mavsitl
 from mavsitl.errors import MavsitlError
-from mavsitl.keep import replace_file
+from mavsitl.keep import replace_json
 from mavsitl.report.metrics import PAPER_TABLES, paper_case
 from mavsitl.scenario import Controller, Flight
 
@@ -111,7 +111,7 @@ def write_run(folder: Path, run: Run) -> Path:
     path = folder / RUN_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        replace_file(path, msgspec.json.format(msgspec.json.encode(run), indent=2) + b"\n")
+        replace_json(path, run)
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path

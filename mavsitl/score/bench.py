@@ -20,7 +20,7 @@ from mavsitl.campaign.fly import Row
 from mavsitl.campaign.grid import Case, parse_seeds, source_digest
 from mavsitl.campaign.store import Journal
 from mavsitl.campaign.workers import Workers, fly_all
-from mavsitl.keep import replace_file
+from mavsitl.keep import replace_json
 from mavsitl.score import suite as suites
 from mavsitl.score.external import Program
 from mavsitl.score.score import STOCK, Board
@@ -116,7 +116,7 @@ def save(result: Result, folder: Path) -> Path:
     path = folder / RESULTS_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        replace_file(path, msgspec.json.format(msgspec.json.encode(result), indent=2) + b"\n")
+        replace_json(path, result)
     except OSError as error:
         raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mavsitl.ends import WIRE_LOG, End
-from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
+from mavsitl.ends import WIRE_LOG
+from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG, open_ulog
 from mavsitl.log.tlog import TlogWriter
-from mavsitl.log.topics import GROUND_TOPICS, VEHICLE_TOPICS, Topic
-from mavsitl.log.ulog import MemoryRecorder, Rows, UlogWriter, information
+from mavsitl.log.topics import Topic
+from mavsitl.log.ulog import MemoryRecorder, Rows, UlogWriter
 from mavsitl.scenario import Flight
 
 __all__ = ["LOG_NAMES", "Logs", "Recording"]
@@ -103,14 +103,9 @@ class Logs:
             (folder / name).unlink(missing_ok=True)
         head = f"What {folder.name} of a test was set up with; faults that the test asked for are not in it."
         (folder / SCENARIO_FILE).write_text(toml.write(flight.scenario, head=head), "utf-8")
-        self.vehicle = self._ulog("vehicle", flight)
-        self.ground = self._ulog("ground", flight) if ground else None
+        self.vehicle = open_ulog(folder, "vehicle", flight)
+        self.ground = open_ulog(folder, "ground", flight) if ground else None
         self.wire = TlogWriter(folder / WIRE_LOG)
-
-    def _ulog(self, end: End, flight: Flight) -> UlogWriter:
-        name, topics = (VEHICLE_LOG, VEHICLE_TOPICS) if end == "vehicle" else (GROUND_LOG, GROUND_TOPICS)
-        parameters = {} if end == "vehicle" else flight.airframe.parameters | flight.scenario.parameters
-        return UlogWriter(self.folder / name, information(flight, None), parameters, topics=topics)
 
     def flush(self) -> None:
         for each in (self.vehicle, self.ground, self.wire):

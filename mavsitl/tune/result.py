@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 import mavsitl
-from mavsitl.keep import replace_file
+from mavsitl.keep import replace_file, replace_json
 from mavsitl.report.metrics import LABELS, UNITS, paper_case
 from mavsitl.report.sweep_tables import bounds
 from mavsitl.report.tables import number
@@ -149,7 +149,7 @@ def write(tuning: Tuning, folder: Path, command: str) -> list[Path]:
         "version": mavsitl.__version__, "command": command, "plan": tuning.plan, "dials": tuning.space.dials,
         "trials": tuning.trials, "chosen": tuning.best.number, "held_out": tuning.judged,
     }  # fmt: skip
-    replace_file(paths[-1], msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")
+    replace_json(paths[-1], record)
     return paths
 
 

@@ -15,6 +15,7 @@ from mavsitl import monitor
 from mavsitl.codec import Message
 from mavsitl.dialect import mavlink
 from mavsitl.geodesy import Origin
+from mavsitl.px4_modes import CUSTOM_MODES, NAV_STATES
 from mavsitl.quaternion import to_euler
 
 __all__ = [
@@ -58,20 +59,6 @@ STALE_US = 1_000_000
 """A reference, or a wanted attitude, is shown for so long after it was told."""
 RESTART_US = 1_000_000
 """A vehicle's clock that goes back by more has begun anew."""
-
-PX4_MODES = {
-    (1, 0): "MANUAL", (2, 0): "ALTCTL", (3, 0): "POSCTL", (3, 1): "ORBIT", (4, 2): "AUTO.TAKEOFF",
-    (4, 3): "AUTO.LOITER", (4, 4): "AUTO.MISSION", (4, 5): "AUTO.RTL", (4, 6): "AUTO.LAND", (5, 0): "ACRO",
-    (6, 0): "OFFBOARD", (7, 0): "STABILIZED", (10, 0): "TERMINATION",
-}  # fmt: skip
-"""By main and sub mode, the names of mavros."""
-
-NAV_STATES = {
-    0: "MANUAL", 1: "ALTCTL", 2: "POSCTL", 3: "AUTO.MISSION", 4: "AUTO.LOITER", 5: "AUTO.RTL", 10: "ACRO",
-    12: "AUTO.DESCEND", 13: "TERMINATION", 14: "OFFBOARD", 15: "STABILIZED", 17: "AUTO.TAKEOFF", 18: "AUTO.LAND",
-    21: "ORBIT",
-}  # fmt: skip
-"""By PX4's nav_state, which logs have."""
 
 SENSORS = {
     mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO: "gyro",
@@ -335,7 +322,7 @@ def _mode(message: Message) -> str:
 def mode_name(custom_mode: int) -> str:
     """PX4's main mode in bits 16-23, sub mode in bits 24-31."""
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
-    return PX4_MODES.get((main, sub)) or f"mode {main}.{sub}"
+    return CUSTOM_MODES.get((main, sub)) or f"mode {main}.{sub}"
 
 
 def _current_mode(vehicle: Vehicle, message: Message, now_us: int) -> None:

@@ -21,10 +21,11 @@ from mavsitl.log.errors import LogError
 from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
 from mavsitl.log.topics import Topic
 from mavsitl.log.ulog import read
+from mavsitl.px4_modes import NAV_STATES
 from mavsitl.quaternion import from_euler
 from mavsitl.report.run import RUN_FILE, load_run
 from mavsitl.services.statustext import printable
-from mavsitl.view.model import NAV_STATES, ROW_INTERVAL_US, ROWS, Model, Row, Vehicle, put_link, row_of, shorten
+from mavsitl.view.model import ROW_INTERVAL_US, ROWS, Model, Row, Vehicle, put_link, row_of, shorten
 
 __all__ = ["SPEEDS", "Recorded", "Replay", "Track", "find_flights"]
 
