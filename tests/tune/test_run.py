@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mavsitl import cli, scenario
@@ -17,6 +18,7 @@ from mavsitl.campaign.grid import Case, case
 from mavsitl.campaign.store import Journal
 from mavsitl.report.tune import render
 from mavsitl.tune import flights, result, run
+from mavsitl.tune.objective import TuneError, growth
 
 KEYS = ("controller.position.k_p_per_s2=2:40", "controller.learning.rate=1:100:log")
 SHORT: dict[str, Any] = {"duration_s": 1.0}
@@ -187,6 +189,42 @@ def test_a_part_of_a_flight_is_measured_as_the_whole_would_be() -> None:
     assert part.start.score.error == pytest.approx(whole.start.score.error)
 
 
+def test_against_the_start_each_number_is_measured_by_what_the_first_gains_have() -> None:
+    """So their error is 1 in the search, at whatever length, and about 1 on other seeds."""
+    tuning = carried_out(plan(against="start", search_duration_s=0.5, held_out=(1, 2)))
+    assert tuning.start.score.error == pytest.approx(1.0)
+    assert tuning.judged is not None
+    assert tuning.judged.before.error == pytest.approx(1.0, abs=0.5)
+    other = max(tuning.trials[1:], key=lambda trial: trial.score.error).score
+    ratios = np.array(other.rmse) / np.array(tuning.start.score.rmse)
+    assert other.error == pytest.approx(np.mean(ratios**4) ** 0.25)
+
+
+def test_what_makes_a_number_worse_than_allowed_is_not_chosen() -> None:
+    """The softer, the less the rotors have to do and the further it is from its path."""
+    asked = ("controller.position.k_p_per_s2=2:40", "controller.wind_observer.horizontal_rad_s=1:20")
+    settings = {"duration_s": 4.0}
+    free, bound = (
+        carried_out(
+            plan(settings=settings, asked=asked, against="start", effort_weight=5.0, evaluations=12, no_worse=f)
+        )
+        for f in (None, 1.05)
+    )
+    assert growth(free.best.score.rmse, free.start.score.rmse).max() > 1.05
+    assert growth(bound.best.score.rmse, bound.start.score.rmse).max() <= 1.05
+    assert not bound.allowed(free.best)
+    assert bound.best.score.objective(5.0) > free.best.score.objective(5.0)
+    assert "worse than allowed" in render(bound, "x")
+    assert "worse than allowed" not in render(free, "x")
+
+
+@pytest.mark.parametrize("asked", [{"against": "start"}, {"no_worse": 1.1}])
+def test_nothing_is_compared_with_a_start_that_is_lost(asked: dict[str, Any]) -> None:
+    settings = {"offnominal.rotor_thrust_scale": [0.0, 1.0, 1.0, 1.0], "duration_s": 10.0}
+    with pytest.raises(TuneError, match=r"the gains to begin with lose a flight.*: hover-wind, seed 1001: "):
+        carried_out(plan(settings=settings, evaluations=2, held_out=(1,), **asked))
+
+
 def test_a_file_of_ones_own_keeps_its_airframe_and_waypoints(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     airframe = (Path(scenario.__file__).parent / "airframes" / "paper.toml").read_text("utf-8")
@@ -210,6 +248,8 @@ def test_a_file_of_ones_own_keeps_its_airframe_and_waypoints(tmp_path: Path) -> 
     [
         (("--tune", "controller.position.kp=1:2"), "controller.position has no 'kp'"),
         (("--evaluations", "0"), "'0' is not allowed"),
+        (("--no-worse", "0.9"), "'0.9' is not allowed; allowed: a finite number, 1 or more"),
+        (("--against", "me"), "invalid choice: 'me'"),
         (("--seeds", "7-9", "--held-out", "9"), "seed 7 is in both"),
         (("--set", "controller.law=lqr"), "controller.law: 'lqr' is not allowed"),
     ],
