@@ -152,7 +152,7 @@ def write(tuning: Tuning, folder: Path, command: str) -> list[Path]:
     paths.append(folder / JSON_FILE)
     record = {
         "version": mavsitl.__version__, "command": command, "plan": tuning.plan, "dials": tuning.space.dials,
-        "trials": tuning.trials, "chosen": tuning.best.number, "held_out": tuning.judged,
+        "limits": tuning.limits, "trials": tuning.trials, "chosen": tuning.best.number, "held_out": tuning.judged,
     }  # fmt: skip
     replace_file(paths[-1], msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")
     return paths

@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from mavsitl.campaign.errors import GridError
+from mavsitl.report.metrics import paper_case
 from mavsitl.scenario import load
 from mavsitl.tune.flights import Flights, FlyAll
 from mavsitl.tune.objective import LEAST, Score, Six, TuneError, growth, scale, six
@@ -33,7 +34,9 @@ class Plan:
     against: Against = "paper"
     """What each RMSE is divided by: the paper's number, or what the first gains have on the same seeds."""
     no_worse: float | None = None
-    """The chosen gains have no RMSE above so many times that of the first ones, >= 1; None: they may."""
+    """The chosen gains have no RMSE above so many times that of the first ones, >= 1, and miss no number of the paper's
+    that those reach; None: they may.
+    """
     effort_weight: float = 0.3
     seeds: tuple[int, ...] = (1001, 1002, 1003)
     """Flown by each candidate."""
@@ -63,6 +66,8 @@ class Tuning:
     plan: Plan
     space: Space
     trials: list[Trial] = field(default_factory=list)
+    limits: tuple[Six, ...] = ()
+    """A scenario each, what no RMSE of the chosen gains is above; none: nothing is."""
     judged: Judged | None = None
     """None: it was interrupted before that."""
 
@@ -76,15 +81,12 @@ class Tuning:
         return min(filter(self.allowed, self.trials), key=lambda trial: trial.score.objective(self.plan.effort_weight))
 
     def allowed(self, trial: Trial) -> bool:
-        """No RMSE is further above the first gains' than the plan lets it; the first gains are."""
-        return trial.number == 0 or bool((excess(self.plan, trial.score, self.start.score) <= 0.0).all())
+        """No RMSE is above its limit."""
+        return bool((self.excess(trial.score) <= 0.0).all())
 
-
-def excess(plan: Plan, after: Score, before: Score) -> Floats:
-    """Logarithms of how far each RMSE is above what the plan allows, (scenarios x 6,); empty where it allows all."""
-    if plan.no_worse is None:
-        return np.empty(0)
-    return np.log(growth(after.rmse, before.rmse) / plan.no_worse).ravel()
+    def excess(self, score: Score) -> Floats:
+        """Logarithms of how far each RMSE is above its limit, (scenarios x 6,); empty where there is none."""
+        return np.log(growth(score.rmse, self.limits)).ravel() if self.limits else np.empty(0)
 
 
 def begin(plan: Plan) -> Tuning:
@@ -95,17 +97,11 @@ def begin(plan: Plan) -> Tuning:
     return Tuning(plan, space(plan.names, plan.settings, plan.asked))
 
 
-def paper_scales(plan: Plan) -> tuple[Six, ...]:
-    """A scenario each."""
-    return tuple(scale(load(name, plan.settings).scenario) for name in plan.names)
-
-
 def searched(tuning: Tuning) -> Flights:
     """What a candidate flies in the search, in the paper's measure."""
     plan = tuning.plan
-    return Flights(
-        plan.names, plan.settings, tuning.space, plan.seeds, paper_scales(plan), duration_s=plan.search_duration_s
-    )
+    scales = tuple(scale(load(name, plan.settings).scenario) for name in plan.names)
+    return Flights(plan.names, plan.settings, tuning.space, plan.seeds, scales, duration_s=plan.search_duration_s)
 
 
 def flights_of(tuning: Tuning) -> int:
@@ -137,12 +133,25 @@ def measured(tuning: Tuning, fly_all: FlyAll) -> tuple[Flights, Flights]:
     if lost and (plan.against == "start" or plan.no_worse is not None):
         option = "--against start" if plan.against == "start" else "--no-worse"
         raise TuneError(f"{option}: the gains to begin with lose a flight, so nothing compares with them: {lost}")
-    if plan.against == "start":
-        whole, part = replace(whole, scales=_at_least(long.rmse)), replace(part, scales=_at_least(short.rmse))
-    elif not lost:
+    if not lost:
         pairs = zip(part.scales, short.rmse, long.rmse, strict=True)
         part = replace(part, scales=tuple(six(s * a / np.where(b > 0.0, b, a)) for s, a, b in map(np.array, pairs)))
+        tuning.limits = _limits(plan, short.rmse, part.scales)
+    if plan.against == "start":
+        whole, part = replace(whole, scales=_at_least(long.rmse)), replace(part, scales=_at_least(short.rmse))
     return part, replace(whole, seeds=plan.held_out)
+
+
+def _limits(plan: Plan, start: tuple[Six, ...], scales: tuple[Six, ...]) -> tuple[Six, ...]:
+    """By what the start has, and by the paper's numbers that it reaches: `scales` in the paper's own scenarios."""
+    if plan.no_worse is None:
+        return ()
+    made = []
+    for name, has, number in zip(plan.names, map(np.array, _at_least(start)), scales, strict=True):
+        of_paper = paper_case(load(name, plan.settings).scenario) is not None
+        reached = of_paper & (has <= number)
+        made.append(six(np.minimum(plan.no_worse * has, np.where(reached, number, np.inf))))
+    return tuple(made)
 
 
 def _at_least(rmse: tuple[Six, ...]) -> tuple[Six, ...]:
@@ -164,7 +173,7 @@ def carry_out(tuning: Tuning, fly_all: FlyAll, said: Callable[[Trial], None]) ->
     search(
         tuning.space, evaluate, keep,
         evaluations=plan.evaluations, effort_weight=plan.effort_weight, seed=plan.seed,
-        excess=lambda score: excess(plan, score, tuning.start.score),
+        excess=tuning.excess,
     )  # fmt: skip
     before, after = judging.scores([tuning.start.values, tuning.best.values], fly_all)
     tuning.judged = Judged(before, after, paired(after.errors, before.errors), paired(after.efforts, before.efforts))

@@ -19,6 +19,8 @@ FIRST_STEP = 0.15
 """How far the first candidates are from the start, in shares of each dial's range."""
 LAST_STEP = 0.003
 """Where the search has settled; what is left of the budget goes to a new one from somewhere near the best."""
+MARGIN = 0.002
+"""So far below its limit a constraint is aimed at: what comes to lie on the limit is beyond it half of the time."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def search(
     place = space.start_place
     try:
         objective(place)  # COBYQA itself begins elsewhere when that is near a bound
-        constraints = [NonlinearConstraint(constraint, -np.inf, 0.0)] if constraint(place).size else []
+        constraints = [NonlinearConstraint(constraint, -np.inf, -MARGIN)] if constraint(place).size else []
         before = 0
         while before < len(known):
             before = len(known)

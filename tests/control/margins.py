@@ -1,4 +1,4 @@
-"""Roll's margins with a scenario's gains: `python -m tests.control.margins SCENARIO...`, a row each.
+"""Margins of roll and yaw with a scenario's gains: `python -m tests.control.margins SCENARIO...`, two rows each.
 
 Linearised as in `linear_loop`: by how much its three gains can grow together before it is unstable, with the airframe's
 rotors; and how many of 11 x 11 x 11 weights that the projection allows are unstable with rotors of some lags.
@@ -41,14 +41,14 @@ def unstable_weights(gains: Gains, projection: tuple[float, float], rotor_time_c
 
 def main(names: list[str]) -> None:
     lags = ", ".join(f"{lag_s * 1e3:g}" for lag_s in LAGS_S)
-    print(f"| scenario | gain margin with its own rotors | weights of 1331 unstable with {lags} ms of lag |")
-    print("|---|---:|---:|")
+    print(f"| scenario | axis | gain margin with its own rotors | weights of 1331 unstable with {lags} ms of lag |")
+    print("|---|---|---:|---:|")
     for name in names:
         flight = load(name)
-        controller = flight.scenario.controller
-        margin = gain_margin(controller.roll_pitch, flight.airframe.rotor_time_constant_s)
-        counts = [unstable_weights(controller.roll_pitch, controller.learning.projection, lag_s) for lag_s in LAGS_S]
-        print(f"| {name} | {margin:.2f} | {', '.join(map(str, counts))} |")
+        controller, own_lag_s = flight.scenario.controller, flight.airframe.rotor_time_constant_s
+        for axis, gains in (("roll, pitch", controller.roll_pitch), ("yaw", controller.yaw)):
+            counts = [unstable_weights(gains, controller.learning.projection, lag_s) for lag_s in LAGS_S]
+            print(f"| {name} | {axis} | {gain_margin(gains, own_lag_s):.2f} | {', '.join(map(str, counts))} |")
 
 
 if __name__ == "__main__":

@@ -94,7 +94,7 @@ def test_the_same_seed_gives_the_same_candidates_and_another_goes_elsewhere_when
 
 def test_no_candidate_is_evaluated_twice_and_the_search_ends_where_there_is_nothing_new() -> None:
     """A range of 21 numbers of four digits."""
-    narrow = space(["hover-wind"], {}, ["controller.position.k_p_per_s2=10.8:11"])
+    narrow = space(["hover-wind"], {}, ["controller.position.k_p_per_s2=11.5:11.7"])
     evaluated: list[tuple[float, ...]] = []
 
     def watched(values: tuple[float, ...]) -> Score:
