@@ -36,9 +36,7 @@ def trade_off(tuning: Tuning) -> Drawing:
         axes.plot(*np.array(kept).reshape(-1, 2).T, ".", color=TRIED, markersize=6, label="tried")
         if not all(allowed):
             refused = [point for point, is_allowed in zip(points, allowed, strict=True) if not is_allowed]
-            axes.plot(
-                *np.array(refused).T, "x", color=TRIED, markersize=4, markeredgewidth=0.8, label="worse than allowed"
-            )
+            axes.plot(*np.array(refused).T, "x", color=TRIED, markersize=4, markeredgewidth=0.8, label="not allowed")
         axes.step(
             *np.array(best).reshape(-1, 2).T, where="post", color=FRONT, linewidth=1.2, marker="o", markersize=4,
             label="not beaten in both",
@@ -59,7 +57,9 @@ def trade_off(tuning: Tuning) -> Drawing:
         axes.set_ylabel(ERROR)
         if flown:
             _logarithmic(axes)
-        figure.legend(*axes.get_legend_handles_labels(), loc="upper right", ncols=6, borderaxespad=0.2)
+        figure.legend(
+            *axes.get_legend_handles_labels(), loc="upper right", ncols=6, borderaxespad=0.2, columnspacing=1.4
+        )
 
     said = f"; {lost} lost a flight and are not shown" if lost else ""
     return Drawing(svg(draw, 4.4, "trade-off"), f"Error against effort of all {len(tuning.trials)} tried{said}", "")
