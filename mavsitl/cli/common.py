@@ -108,24 +108,24 @@ def whole(least: int, most: int) -> Callable[[str], int]:
     return read
 
 
-def above_zero(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: a finite number above 0")
-    return value
+def _number(allowed: Callable[[float], bool], said: str) -> Callable[[str], float]:
+    """The type of an option that takes a finite number."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and allowed(value)):
+            raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: a finite number{said}")
+        return value
+
+    return read
 
 
-def not_negative(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; allowed: a finite number, 0 or more")
-    return value
+above_zero = _number(lambda value: value > 0.0, " above 0")
+not_negative = _number(lambda value: value >= 0.0, ", 0 or more")
+at_least_1 = _number(lambda value: value >= 1.0, ", 1 or more")
 
 
 def speed_factor(text: str) -> float:

@@ -14,6 +14,7 @@ from mavsitl.cli.common import (
     above_zero,
     add_json,
     add_scenario_options,
+    at_least_1,
     command,
     command_line,
     interrupt,
@@ -36,9 +37,12 @@ under the same few seeds; what is found is then judged against the start on seed
 a scenario the paper's four experiments are flown together.
 
   error      of each scenario and state the RMSE over the paper's number in Tables 3 and 4, or in a scenario that is
-             none of the paper's over 0.1 m and 0.5 degrees; of these ratios the 4-norm: the worst count most
+             none of the paper's over 0.1 m and 0.5 degrees, or with --against start over what the gains to begin with
+             have there; of these ratios the 4-norm: the worst count most
   effort     RMS of the rotors' speeds about their mean, rad/s
-  searched   the least error x effort^W, W being --effort-weight; a lost flight is worse than any that was flown
+  searched   the least error x effort^W, W being --effort-weight, with no RMSE above --no-worse times that of the gains
+             to begin with, and no number of the paper's missed that those reach; a lost flight is worse than any that
+             was flown
 
 The search starts at the gains that the scenarios have, and is SciPy's COBYQA. --tune KEY=LOW:HIGH names what is turned
 and how far, with :log or :linear behind it for how the range is divided; without a range it is a fifth of the value to
@@ -57,6 +61,7 @@ examples:
   mavsitl tune hover-wind-realistic --jobs 8 --evaluations 300
   mavsitl tune my.toml --tune controller.position.k_p_per_s2=1:20 --tune controller.learning.rate=1:100:log
   mavsitl tune hover-wind --search-duration 20 --effort-weight 0.5 --output runs/gentle
+  mavsitl tune my.toml --against start --no-worse 1.02    better, and nothing worse by more than 2 %
   mavsitl tune --seeds 2001-2008 --held-out 50 --scheduler tcp://192.0.2.7:8786
 
 Exit codes: 0 done, whether something better was found or not; 1 it cannot go on; 2 wrong arguments; 130 interrupted.
@@ -80,6 +85,15 @@ def add(commands: Any) -> None:
     group.add_argument(
         "--effort-weight", type=not_negative, default=0.3, metavar="W",
         help="what 1 %% of effort has to buy, in %% of error (default: 0.3)",
+    )  # fmt: skip
+    group.add_argument(
+        "--against", choices=("paper", "start"), default="paper",
+        help="what each RMSE is divided by: the paper's number, or that of the gains to begin with (default: paper)",
+    )  # fmt: skip
+    group.add_argument(
+        "--no-worse", type=at_least_1, metavar="F",
+        help="no RMSE of any scenario and state above F times that of the gains to begin with, and none of the paper's "
+        "numbers missed that those reach (default: no bound)",
     )  # fmt: skip
     group.add_argument(
         "--seeds", default="1001-1003", metavar="SEEDS", help="flown by each candidate (default: 1001-1003)"
@@ -108,7 +122,8 @@ def _tune(options: argparse.Namespace) -> int:
     check_run_options(options)
     plan = run.Plan(
         names=tuple(options.scenarios or PAPER_SCENARIOS), settings=overrides_of(settings_of(options)),
-        asked=tuple(options.keys), evaluations=options.evaluations, effort_weight=options.effort_weight,
+        asked=tuple(options.keys), evaluations=options.evaluations, against=options.against,
+        no_worse=options.no_worse, effort_weight=options.effort_weight,
         seeds=parse_seeds(options.seeds), held_out=parse_seeds(options.held_out),
         search_duration_s=options.search_duration, seed=options.search_seed,
     )  # fmt: skip

@@ -41,6 +41,8 @@ def render(tuning: Tuning, command: str) -> str:
         held_out=result.span(tuning.plan.held_out),
         judged=tuning.judged is not None,
         measures=list(result.measures(tuning)),
+        against=tuning.plan.against,
+        no_worse=tuning.plan.no_worse,
         effort_weight=tuning.plan.effort_weight,
         shortened=tuning.plan.search_duration_s,
         drawings=[(with_ids(each.svg, f"t{index}-"), each) for index, each in enumerate(drawn)],

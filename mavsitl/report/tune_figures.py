@@ -27,12 +27,16 @@ def trade_off(tuning: Tuning) -> Drawing:
     flown = [trial for trial in tuning.trials if not trial.score.lost]
     lost = len(tuning.trials) - len(flown)
     points = [(trial.score.effort, trial.score.error) for trial in flown]
-    best = [points[index] for index in front(points)]
+    allowed = [tuning.allowed(trial) for trial in flown]
+    kept = [point for point, is_allowed in zip(points, allowed, strict=True) if is_allowed]
+    best = [kept[index] for index in front(kept)]
 
     def draw(figure: Figure) -> None:
         axes = _axes(figure, 1)[0]
-        efforts, errors = np.array(points).reshape(-1, 2).T
-        axes.plot(efforts, errors, ".", color=TRIED, markersize=6, label="tried")
+        axes.plot(*np.array(kept).reshape(-1, 2).T, ".", color=TRIED, markersize=6, label="tried")
+        if not all(allowed):
+            refused = [point for point, is_allowed in zip(points, allowed, strict=True) if not is_allowed]
+            axes.plot(*np.array(refused).T, "x", color=TRIED, markersize=4, markeredgewidth=0.8, label="not allowed")
         axes.step(
             *np.array(best).reshape(-1, 2).T, where="post", color=FRONT, linewidth=1.2, marker="o", markersize=4,
             label="not beaten in both",
@@ -53,7 +57,9 @@ def trade_off(tuning: Tuning) -> Drawing:
         axes.set_ylabel(ERROR)
         if flown:
             _logarithmic(axes)
-        figure.legend(*axes.get_legend_handles_labels(), loc="upper right", ncols=5, borderaxespad=0.2)
+        figure.legend(
+            *axes.get_legend_handles_labels(), loc="upper right", ncols=6, borderaxespad=0.2, columnspacing=1.4
+        )
 
     said = f"; {lost} lost a flight and are not shown" if lost else ""
     return Drawing(svg(draw, 4.4, "trade-off"), f"Error against effort of all {len(tuning.trials)} tried{said}", "")
@@ -63,7 +69,9 @@ def convergence(tuning: Tuning) -> Drawing:
     """Each trial, and the best so far."""
     weight = tuning.plan.effort_weight
     numbers = np.arange(len(tuning.trials))
-    objectives = np.array([trial.score.objective(weight) for trial in tuning.trials])
+    objectives = np.array(
+        [trial.score.objective(weight) if tuning.allowed(trial) else np.inf for trial in tuning.trials]
+    )
     newest = np.maximum.accumulate(np.where(objectives <= np.minimum.accumulate(objectives), numbers, 0))
     flown = np.array([not trial.score.lost for trial in tuning.trials])
 

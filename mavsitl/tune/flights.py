@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import msgspec
-import numpy as np
 
 from mavsitl.campaign.fly import Row
 from mavsitl.campaign.grid import Case, case
 from mavsitl.campaign.store import Journal
 from mavsitl.campaign.workers import Workers, fly_all
 from mavsitl.scenario import Flight, load
-from mavsitl.tune.objective import Score, Six, scale, score, six
+from mavsitl.tune.objective import Score, Six, score
 from mavsitl.tune.space import Overrides, Space
 
 FlyAll: TypeAlias = Callable[[Sequence[Case]], Iterator[Row]]
@@ -48,10 +47,10 @@ class Flights:
     """Changes to all of them."""
     space: Space
     seeds: tuple[int, ...]
+    scales: tuple[Six, ...]
+    """A scenario each: what the RMSE of each state is divided by."""
     duration_s: float | None = None
     """So much of each flight at most; None: as long as its scenario says."""
-    factors: tuple[Six, ...] | None = None
-    """A scenario each, by which its scale is multiplied: what a part of a flight shows of the whole; None: 1."""
 
     @property
     def each(self) -> int:
@@ -64,23 +63,18 @@ class Flights:
 
     def scores(self, candidates: Sequence[tuple[float, ...]], fly_all: FlyAll) -> list[Score]:
         """In their order."""
-        factors = self.factors or ((1.0,) * 6,) * len(self.names)
-        scales: list[Six] = []
         durations_s: list[float] = []
         grid: list[list[list[Case]]] = []
         for values in candidates:
             grid.append([])
             labels = {dial.key: value for dial, value in zip(self.space.dials, values, strict=True)}
-            for name, factor in zip(self.names, factors, strict=True):
-                flight = self.flight(name, values)
-                whole = scale(flight.scenario)
-                scales.append(six(np.multiply(whole, factor)))
-                flight = self._shortened(flight)
+            for name in self.names:
+                flight = self._shortened(self.flight(name, values))
                 durations_s.append(flight.scenario.duration_s)
                 grid[-1].append([case(flight, seed, labels) for seed in self.seeds])
         rows = {row.key: row for row in fly_all([each for of in grid for group in of for each in group])}
-        n = len(self.names)
-        return [score([[rows[each.key] for each in group] for group in of], scales[:n], durations_s[:n]) for of in grid]
+        flown = [[[rows[each.key] for each in group] for group in of] for of in grid]
+        return [score(each, self.scales, durations_s[: len(self.names)]) for each in flown]
 
     def _shortened(self, flight: Flight) -> Flight:
         scenario = flight.scenario

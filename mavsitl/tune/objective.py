@@ -28,15 +28,24 @@ SCALE: Six = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)
 NORM = 4
 """The power whose mean over scenarios and states is taken: the worst numbers count most, and smoothly."""
 
-_WORST_ERROR = 13.0
+LEAST: Six = (1e-4, 1e-4, 1e-4, 5e-4, 5e-4, 5e-4)
+"""An RMSE below this, m and degrees, counts as this when another is divided by it."""
+
+WORST = 13.0
 _WORST_EFFORT = 12.0
-"""Above the logarithms of any flown flight's error (20 m over the paper's least number) and effort / (rad/s)."""
+"""Above the logarithms of any flown flight's error (20 m over `LEAST`) and effort / (rad/s)."""
 
 
 def scale(scenario: Scenario) -> Six:
     """What each state's RMSE is divided by: the paper's number where it has one, else `SCALE`."""
     case = paper_case(scenario)
     return SCALE if case is None else PAPER_TABLES[case].values()
+
+
+def growth(after: Sequence[Six], before: Sequence[Six]) -> Floats:
+    """How many times as large each RMSE has become, (scenarios, 6); infinite where a flight was lost after alone."""
+    now, then = np.maximum(after, LEAST), np.maximum(before, LEAST)
+    return np.divide(now, then, out=np.ones_like(now), where=now != then)
 
 
 @dataclass(frozen=True)
@@ -75,7 +84,7 @@ class Score:
         all that were flown, and the less was flown the higher.
         """
         if self.lost:
-            return _WORST_ERROR + effort_weight * _WORST_EFFORT + self.unflown
+            return WORST + effort_weight * _WORST_EFFORT + self.unflown
         return log(self.error) + effort_weight * log(self.effort)
 
 

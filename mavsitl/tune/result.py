@@ -16,12 +16,15 @@ from mavsitl.report.sweep_tables import bounds
 from mavsitl.report.tables import number
 from mavsitl.scenario import Flight, Waypoints, load
 from mavsitl.tune import toml
-from mavsitl.tune.objective import Score, scale
+from mavsitl.tune.objective import Score, growth, scale
 from mavsitl.tune.paired import Paired
 from mavsitl.tune.run import Tuning
 from mavsitl.tune.space import ITEM
 
 JSON_FILE = "tune.json"
+
+WORST_STATE = "worst RMSE, after / before"
+"""Of all scenarios and states the largest ratio."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +83,13 @@ def measures(tuning: Tuning) -> Iterator[Measure]:
     start, best = tuning.start.score, tuning.best.score
     yield Measure("error", searched, start.error, best.error, None)
     yield Measure("effort / (rad/s)", searched, start.effort, best.effort, None)
+    yield Measure(WORST_STATE, searched, 1.0, float(growth(best.rmse, start.rmse).max()), None)
     judged = tuning.judged
     if judged is not None:
         held_out = f"held out: {span(tuning.plan.held_out)}"
         yield Measure("error", held_out, judged.before.error, judged.after.error, judged.error)
         yield Measure("effort / (rad/s)", held_out, judged.before.effort, judged.after.effort, judged.effort)
+        yield Measure(WORST_STATE, held_out, 1.0, float(growth(judged.after.rmse, judged.before.rmse).max()), None)
 
 
 def gains(tuning: Tuning) -> list[Gain]:
@@ -147,7 +152,7 @@ def write(tuning: Tuning, folder: Path, command: str) -> list[Path]:
     paths.append(folder / JSON_FILE)
     record = {
         "version": mavsitl.__version__, "command": command, "plan": tuning.plan, "dials": tuning.space.dials,
-        "trials": tuning.trials, "chosen": tuning.best.number, "held_out": tuning.judged,
+        "limits": tuning.limits, "trials": tuning.trials, "chosen": tuning.best.number, "held_out": tuning.judged,
     }  # fmt: skip
     replace_json(paths[-1], record)
     return paths

@@ -145,8 +145,8 @@ Loss of single messages, a fifth of them, barely shows at any level, as the next
 stretch does: the vehicle goes on with the last setpoint, a tilt or a rotation, until the next one or its fail-safe.
 
 The more of the loop is on the ground, the less delay it bears. `torque` and `body_rate` close the attitude loop over
-the link; with the shipped gains it crosses over at about 105 rad/s with some 80° of phase margin, which a round trip of
-14 ms takes away. Just beyond, the vehicle still holds its position and shakes: the angles tell it before the position
+the link; with the shipped gains it crosses over at about 91 rad/s with some 80° of phase margin, which a round trip of
+15 ms takes away. Just beyond, the vehicle still holds its position and shakes: the angles tell it before the position
 does. `attitude` closes the position loop alone over the link.
 
 ## What OFFBOARD bears

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mavsitl import scenario
 from mavsitl.campaign.fly import Row
 from mavsitl.report.metrics import PAPER_TABLES
-from mavsitl.tune.objective import SCALE, Six, TuneError, front, scale, score
+from mavsitl.tune.objective import LEAST, SCALE, Six, TuneError, front, growth, scale, score
 from mavsitl.tune.paired import paired
 
 ONES: Six = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
@@ -52,6 +52,14 @@ def test_a_lost_flight_is_worse_than_any_that_was_flown(
 def test_of_lost_ones_the_one_that_flew_longer_is_better() -> None:
     short, long = (score([[row(None, time_s=time_s)]], [ONES], [60.0]) for time_s in (5.0, 50.0))
     assert long.objective(0.3) < short.objective(0.3)
+
+
+def test_growth_is_of_each_number_and_next_to_nothing_is_no_measure() -> None:
+    after: Six = (0.3, 0.1, 1e-5, 1.0, inf, inf)
+    before: Six = (0.2, inf, 0.0, 0.0, 1.0, inf)
+    found = growth([after], [before])
+    assert found.shape == (1, 6)
+    assert found[0].tolist() == pytest.approx([1.5, 0.0, 1.0, 1.0 / LEAST[3], inf, 1.0])
 
 
 def test_without_rotor_speeds_in_the_log_there_is_no_effort() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mavsitl import cli, scenario
@@ -15,8 +16,10 @@ from mavsitl.campaign import workers
 from mavsitl.campaign.fly import Row, fly
 from mavsitl.campaign.grid import Case, case
 from mavsitl.campaign.store import Journal
+from mavsitl.report.metrics import PAPER_TABLES
 from mavsitl.report.tune import render
 from mavsitl.tune import flights, result, run
+from mavsitl.tune.objective import TuneError, growth, six
 
 KEYS = ("controller.position.k_p_per_s2=2:40", "controller.learning.rate=1:100:log")
 SHORT: dict[str, Any] = {"duration_s": 1.0}
@@ -77,7 +80,7 @@ def test_the_command_leaves_scenarios_that_fly_with_what_was_found(
     rows = (tmp_path / "run" / "rows.jsonl").read_text("utf-8").splitlines()
     candidates, judged = 4, 1 if record["chosen"] == 0 else 2
     assert len(record["trials"]) == candidates
-    assert json.loads(rows[0])["labels"] == {"controller.position.k_p_per_s2": 10.89, "controller.learning.rate": 10.0}
+    assert json.loads(rows[0])["labels"] == {"controller.position.k_p_per_s2": 11.56, "controller.learning.rate": 13.4}
     assert len(rows) == 2 * (candidates + 1) + 2 * 2 * judged  # and the start's whole flights, to measure by
 
 
@@ -188,6 +191,54 @@ def test_a_part_of_a_flight_is_measured_as_the_whole_would_be() -> None:
     assert part.start.score.error == pytest.approx(whole.start.score.error)
 
 
+def test_against_the_start_each_number_is_measured_by_what_the_first_gains_have() -> None:
+    """So their error is 1 in the search, at whatever length, and about 1 on other seeds."""
+    tuning = carried_out(plan(against="start", search_duration_s=0.5, held_out=(1, 2)))
+    assert tuning.start.score.error == pytest.approx(1.0)
+    assert tuning.judged is not None
+    assert tuning.judged.before.error == pytest.approx(1.0, abs=0.5)
+    other = max(tuning.trials[1:], key=lambda trial: trial.score.error).score
+    ratios = np.array(other.rmse) / np.array(tuning.start.score.rmse)
+    assert other.error == pytest.approx(np.mean(ratios**4) ** 0.25)
+
+
+def test_what_makes_a_number_worse_than_allowed_is_not_chosen() -> None:
+    """The softer, the less the rotors have to do and the further it is from its path."""
+    asked = ("controller.position.k_p_per_s2=2:40", "controller.wind_observer.horizontal_rad_s=1:20")
+    settings = {"duration_s": 4.0}
+    free, bound = (
+        carried_out(
+            plan(settings=settings, asked=asked, against="start", effort_weight=5.0, evaluations=12, no_worse=f)
+        )
+        for f in (None, 1.05)
+    )
+    assert growth(free.best.score.rmse, free.start.score.rmse).max() > 1.05
+    assert growth(bound.best.score.rmse, bound.start.score.rmse).max() <= 1.05
+    assert not bound.allowed(free.best)
+    assert bound.best.score.objective(5.0) > free.best.score.objective(5.0)
+    assert "not allowed" in render(bound, "x")
+    assert "not allowed" not in render(free, "x")
+
+
+def test_no_number_of_the_papers_that_the_start_reaches_is_allowed_to_be_missed() -> None:
+    """In the paper's scenarios; where the start misses it, and elsewhere, it is the start alone that counts."""
+    paper = PAPER_TABLES["hover-wind"].values()
+    shares = (0.9, 1.0, 1.1, 0.5, 0.8, 2.0)
+    start = six(np.multiply(paper, shares))
+    both = plan(names=("hover-wind", "hover-gust"), settings={}, no_worse=1.5)
+    of_paper, of_another = run._limits(both, (start, start), (paper, paper))
+    assert np.divide(of_paper, paper) == pytest.approx([1.0, 1.0, 1.65, 0.75, 1.0, 3.0])
+    assert np.divide(of_another, paper) == pytest.approx(1.5 * np.array(shares))
+    assert run._limits(plan(), (start,), (paper,)) == ()
+
+
+@pytest.mark.parametrize("asked", [{"against": "start"}, {"no_worse": 1.1}])
+def test_nothing_is_compared_with_a_start_that_is_lost(asked: dict[str, Any]) -> None:
+    settings = {"offnominal.rotor_thrust_scale": [0.0, 1.0, 1.0, 1.0], "duration_s": 10.0}
+    with pytest.raises(TuneError, match=r"the gains to begin with lose a flight.*: hover-wind, seed 1001: "):
+        carried_out(plan(settings=settings, evaluations=2, held_out=(1,), **asked))
+
+
 def test_a_file_of_ones_own_keeps_its_airframe_and_waypoints(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     airframe = (Path(scenario.__file__).parent / "airframes" / "paper.toml").read_text("utf-8")
@@ -211,6 +262,8 @@ def test_a_file_of_ones_own_keeps_its_airframe_and_waypoints(tmp_path: Path) -> 
     [
         (("--tune", "controller.position.kp=1:2"), "controller.position has no 'kp'"),
         (("--evaluations", "0"), "'0' is not allowed"),
+        (("--no-worse", "0.9"), "'0.9' is not allowed; allowed: a finite number, 1 or more"),
+        (("--against", "me"), "invalid choice: 'me'"),
         (("--seeds", "7-9", "--held-out", "9"), "seed 7 is in both"),
         (("--set", "controller.law=lqr"), "controller.law: 'lqr' is not allowed"),
     ],

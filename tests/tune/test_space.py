@@ -21,7 +21,7 @@ def test_the_defaults_are_the_gains_that_the_controller_reads() -> None:
     assert "controller.learning.rate" in keys
     place = keys.index("controller.position.k_p_per_s2")
     assert made.start[place] == Controller().position.k_p_per_s2
-    assert (made.dials[place].low, made.dials[place].high, made.dials[place].log) == (2.178, 54.45, True)
+    assert (made.dials[place].low, made.dials[place].high, made.dials[place].log) == (2.312, 57.8, True)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_a_gain_of_0_stays_out_unless_it_has_a_range() -> None:
         ("controller.position.k_p_per_s2=1:inf", "'1:inf' is no range"),
         ("controller.position.k_p_per_s2=", "'' is no range"),
         ("controller.position.k_i_per_s3=0:1:log", "a logarithm needs LOW > 0"),
-        ("controller.position.k_p_per_s2=1:5", "begins at the scenario's value, 10.89, outside of it"),
+        ("controller.position.k_p_per_s2=1:5", "begins at the scenario's value, 11.56, outside of it"),
         ("controller.position.k_d_per_s=-1:9", "controller.position.k_d_per_s: -1.0 is not allowed"),
         ("controller.learning.rate[3]", "no such item; allowed: an index from 0 to 2"),
         ("controller.position.k_p_per_s2[0]", "no such item; allowed: no index"),
@@ -74,7 +74,9 @@ def test_a_wrong_key_or_range_is_named(asked: str, said: str) -> None:
 
 def test_scenarios_that_differ_in_a_key_are_refused() -> None:
     names = ("hover-wind", "hover-wind-realistic")
-    with pytest.raises(ScenarioError, match=r"hover-wind has 10\.89 and hover-wind-realistic 9\.0; give both the same"):
+    with pytest.raises(
+        ScenarioError, match=r"hover-wind has 11\.56 and hover-wind-realistic 7\.749; give both the same"
+    ):
         space(names, {}, ["controller.position.k_p_per_s2"])
     assert space(names, {"controller.position.k_p_per_s2": 10.0}, ["controller.position.k_p_per_s2"]).start == (10.0,)
 
@@ -90,7 +92,7 @@ def test_an_array_is_turned_as_one_or_item_by_item() -> None:
     whole = space(["hover-wind"], {}, ["controller.learning.rate=1:100"])
     assert whole.overrides([3.0]) == {"controller.learning.rate": [3.0, 3.0, 3.0]}
     items = space(["hover-wind"], {}, ["controller.learning.rate[0]", "controller.learning.rate[2]"])
-    assert items.overrides([3.0, 4.0]) == {"controller.learning.rate": [3.0, 10.0, 4.0]}
+    assert items.overrides([3.0, 4.0]) == {"controller.learning.rate": [3.0, 13.4, 4.0]}
     with pytest.raises(ScenarioError, match="its items differ"):
         space(["hover-wind"], {"controller.learning.rate": [1.0, 2.0, 3.0]}, ["controller.learning.rate"])
 
