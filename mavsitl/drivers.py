@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -51,6 +52,8 @@ FLUSH_WALL_US = 500_000
 """Real time: and as often on the wall clock, so that a kill costs less than a second of whatever is slower."""
 SAY_LOST_US = 5_000_000
 """Real time: wall clock between two warnings that the schedule was moved."""
+LOAD_US = 1_000_000
+"""Real time: wall clock over which the load is measured."""
 CHECK_WAIT_S, NO_SOCKET_WAIT_S = 0.02, 0.002
 """Of a check: longest wait for a datagram; and a pause where there is nothing to wait for, a server not there yet."""
 
@@ -92,6 +95,9 @@ class VehicleCore(Core, Protocol):
 class RealTimeVehicleCore(VehicleCore, Keeping, Protocol):
     def warn(self, text: str) -> None:
         """What the driver has to say to whoever flies it."""
+
+    def set_load(self, load: float) -> None:
+        """The share of a processor that the process takes, 0 to 1 for each of its threads that is never idle."""
 
     def receive(self, port: int, datagram: bytes, at_us: int | None = None) -> int:
         """`at_us`: when it came, from the last tick to just before the next; None: at the tick."""
@@ -659,6 +665,7 @@ def run_realtime_vehicle(
         say(text)
 
     lost = LostTime(warn)
+    load = Load(vehicle.set_load)
 
     def send() -> None:
         for port, link in enumerate(links):
@@ -696,6 +703,7 @@ def run_realtime_vehicle(
             tap.tick(now_us, wall_us)
             if clock.lost_us != lost.told_us:
                 lost.tell(clock.lost_us, wall_us)
+            load.step(wall_us)
             throttle(vehicle)
             now_us = next_us
     finally:
@@ -718,6 +726,26 @@ class LostTime:
             self._next_us = now_us + SAY_LOST_US
             self._warn(f"Suspended or overloaded: {(lost_us - self.told_us) / 1e6:.1f} s of real time given up")
             self.told_us = lost_us
+
+
+class Load:
+    """Measures the share of a processor that this process takes: SYS_STATUS.load."""
+
+    def __init__(self, tell: Callable[[float], None], used_ns: Callable[[], int] = time.process_time_ns) -> None:
+        self._tell = tell
+        self._used_ns = used_ns
+        self._begin_us: int | None = None
+        self._begin_ns = 0
+
+    def step(self, now_us: int) -> None:
+        """To be called on the wall clock, often."""
+        begin_us = self._begin_us
+        if begin_us is not None and now_us < begin_us + LOAD_US:
+            return
+        used_ns = self._used_ns()
+        if begin_us is not None:
+            self._tell((used_ns - self._begin_ns) / (now_us - begin_us) * 1e-3)
+        self._begin_us, self._begin_ns = now_us, used_ns
 
 
 def run_realtime_ground(

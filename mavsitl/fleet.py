@@ -19,6 +19,7 @@ from mavsitl.drivers import (
     PROGRESS_INTERVAL_US,
     GroundCore,
     Intake,
+    Load,
     LockstepError,
     LostTime,
     Progress,
@@ -65,6 +66,7 @@ class FleetCore(Keeping, Protocol):
 
     def refuse(self, port: int, excess: Excess) -> None: ...
     def warn(self, text: str) -> None: ...
+    def set_load(self, load: float) -> None: ...
     def close(self) -> None: ...
 
 
@@ -108,6 +110,7 @@ def run_realtime_fleet(
         say(text)
 
     lost = LostTime(warn)
+    load = Load(fleet.set_load)
 
     def send() -> None:
         for port, datagrams in fleet.outgoing():
@@ -146,6 +149,7 @@ def run_realtime_fleet(
                     tap.tick(now_us, wall_us)
                 if clock.lost_us != lost.told_us:
                     lost.tell(clock.lost_us, wall_us)
+                load.step(wall_us)
                 if progress is not None and wall_us - progressed_us >= PROGRESS_INTERVAL_US:
                     progressed_us = wall_us
                     progress(fleet.flight_time_s)

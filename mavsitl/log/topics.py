@@ -170,6 +170,12 @@ WIND = Topic(
     text="As estimated in flight; not in lock-step.",
     rate=SECOND,
 )
+CPULOAD = Topic(
+    "cpuload",
+    ("float load", "float ram_usage"),
+    text="Share of a processor that the process takes; memory is not measured (NaN). Not in lock-step.",
+    rate=SECOND,
+)
 
 # Vehicle: what is wanted
 LOCAL_POSITION_SETPOINT = Topic(
@@ -460,6 +466,7 @@ VEHICLE_TOPICS = (
     GLOBAL_POSITION,
     GLOBAL_POSITION_TRUTH,
     WIND,
+    CPULOAD,
     BATTERY_STATUS,
     FAILSAFE_FLAGS,
     HOME_POSITION,

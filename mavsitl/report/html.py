@@ -12,6 +12,7 @@ import numpy as np
 
 from mavsitl.log.flight import FlightData, FlightError
 from mavsitl.log.ulog import LogError
+from mavsitl.px4_modes import NAV_STATES
 from mavsitl.report import figures, metrics, tables
 from mavsitl.report.figures import CALM, WIND, Drawing
 from mavsitl.report.run import FlightRecord, Run, RunError, load_run
@@ -23,12 +24,6 @@ REPORT_FILE = "report.html"
 
 # Counterparts in the paper, by path: (figure of calm air, figure of wind) or one for both.
 _PAIRS = {"hover": "Set-point hover", "spiral": "Path following: spiral"}
-_MODES = {
-    0: "MANUAL", 1: "ALTCTL", 2: "POSCTL", 3: "AUTO.MISSION", 4: "AUTO.LOITER", 5: "AUTO.RTL", 10: "ACRO",
-    12: "DESCEND", 13: "TERMINATION", 14: "OFFBOARD", 15: "STABILIZED", 17: "AUTO.TAKEOFF", 18: "AUTO.LAND",
-    21: "ORBIT",
-}  # fmt: skip
-"""PX4's vehicle_status.nav_state."""
 _ATTITUDE = {"hover": ("Fig. 9", "Fig. 10"), "spiral": ("Fig. 13", "Fig. 14")}
 
 
@@ -83,7 +78,7 @@ class Shown:
             f"tilt at most {since.tilt_deg:.0f}°, yaw rate at most {since.yaw_rate_deg_s:.0f}°/s"
         )
         lines += [
-            f"{_MODES.get(status.nav_state, f'nav_state {status.nav_state}')}"
+            f"{NAV_STATES.get(status.nav_state, f'nav_state {status.nav_state}')}"
             f"{', fail-safe' if status.failsafe else ''}{'' if status.armed else ', disarmed'}"
             f" at {status.time_s:.1f} s"
             for status in data.statuses

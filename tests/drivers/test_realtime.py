@@ -13,13 +13,17 @@ from mavsitl_vehicle.vehicle import Vehicle
 
 from mavsitl import drivers, ends, pair
 from mavsitl.clock import PacedClock
-from mavsitl.drivers import Tap
+from mavsitl.codec import parse
+from mavsitl.dialect import mavlink
+from mavsitl.drivers import Load, Tap
 from mavsitl.ends import NullRecorder, VehicleLinks
 from mavsitl.link.address import Address
 from mavsitl.link.base import Link
 from mavsitl.link.impaired import ImpairedLink, channels_for
 from mavsitl.link.memory import memory_pair
 from mavsitl.link.udp import LOOPBACK
+from mavsitl.log import topics
+from mavsitl.log.ulog import MemoryRecorder
 from tests.drivers.exercise import shortened
 
 
@@ -103,6 +107,21 @@ def test_a_vehicle_flies_on_the_wall_clock(wall: Wall, speed: float) -> None:
     assert 2_000_000 < timing.simulated_us < 10_000_000
     assert timing.lateness.count == timing.simulated_us // vehicle.period_us
     assert len(station.receive(0)) > 10
+
+
+def test_a_vehicle_says_how_busy_its_process_is(wall: Wall, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SYS_STATUS.load and cpuload in the log: 0 until the first second is over, then what the last second took."""
+    monkeypatch.setattr(drivers, "Load", lambda tell: Load(tell, lambda: wall.ns // 4))
+    log = MemoryRecorder()
+    vehicle = Vehicle(shortened("hover-calm", 1.0), log, seed=1)
+    near, far = memory_pair()
+    drivers.run_realtime_vehicle(vehicle, [near], Tap(), stop=lambda: wall.ns > 3.1e9)
+    frames = (frame for datagram, _ in far.receive(0, limit=100_000) for frame in parse(datagram))
+    loads = [frame.message.load for frame in frames if frame.message_id == mavlink.MAVLINK_MSG_ID_SYS_STATUS]
+    assert loads[0] == 0
+    assert loads[-1] == 250
+    assert set(loads) == {0, 250}
+    assert log.arrays(topics.CPULOAD)["load"] == pytest.approx([0.25, 0.25], rel=1e-3)
 
 
 def test_a_vehicle_flies_over_a_bad_link_on_the_wall_clock(wall: Wall) -> None:

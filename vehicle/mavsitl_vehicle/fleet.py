@@ -192,6 +192,11 @@ class Fleet:
         for vehicle in self.vehicles:
             vehicle.warn(text)
 
+    def set_load(self, load: float) -> None:
+        """The share of a processor that all of them take together."""
+        for vehicle in self.vehicles:
+            vehicle.set_load(load)
+
     # --- what is kept ------------------------------------------------------------------------------------------------
 
     def unsaved(self, now_us: int) -> list[Work]:

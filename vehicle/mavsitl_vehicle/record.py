@@ -214,6 +214,8 @@ class Record:
             self._second_us = now_us + SECOND_US
             self._write_ports(now_us, vehicle)
             self._write_wind(now_us, vehicle)
+            if vehicle.autopilot.load > 0.0:
+                self._recorder.topic(topics.CPULOAD).append(now_us, vehicle.autopilot.load, nan)
 
     def _write_state(self, now_us: int, autopilot: Autopilot, shown: Shown) -> None:
         """Of what is shown the log tells what it does not tell already."""

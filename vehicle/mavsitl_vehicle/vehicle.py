@@ -171,6 +171,10 @@ class Vehicle:
         """A warning for whoever flies it: a STATUSTEXT on every link."""
         self.autopilot.queue_text(mavlink.MAV_SEVERITY_WARNING, text)
 
+    def set_load(self, load: float) -> None:
+        """The share of a processor that the process takes, as its driver measures it: SYS_STATUS.load."""
+        self.autopilot.load = load
+
     def unsaved(self, now_us: int) -> list[Work]:
         """What has to be on the disk soon. `now_us` is wall time. See `mavsitl.keep.Keeping`."""
         return self.kept.unsaved(now_us)
