@@ -26,12 +26,12 @@ class TestOnTheRoof:
         flight.run_until(8.0)
         assert_flight(flight).stays_within(0.5, after_s=4)
         flight.run()
-        assert_flight(flight).completes().stays_within(0.5, after_s=16)
+        assert_flight(flight).completes().stays_within(0.5, after_s=11)
 
     def test_a_weak_rotor(self, flight, faults, assert_flight):
         flight.run_until(4.0)
         with faults.parameters(SIM_MOT2_EFF=0.85):
-            flight.run_until(12.0)
+            flight.run_until(9.0)
         assert_flight(flight.run()).completes().tilt_below(40).never_failsafe()
 
 
