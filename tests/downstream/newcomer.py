@@ -148,7 +148,7 @@ class Walk:
         home = folder / "home"
         home.mkdir(parents=True)
         self.variables = clean(
-            HOME=str(home), XDG_CACHE_HOME=str(home / "cache"), XDG_DATA_HOME=str(home / "data"),
+            XDG_CACHE_HOME=str(home / "cache"), XDG_DATA_HOME=str(home / "data"),
             PIP_CACHE_DIR=pip_cache, PYTHONUNBUFFERED="1",
         )  # fmt: skip
         # The Python of the machine, not the one of an environment that is active here.
