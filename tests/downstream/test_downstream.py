@@ -35,6 +35,31 @@ def test_a_file_that_the_wheel_lacks_is_named(folder: Path, monkeypatch: pytest.
         steps.check_wheel(wheel)
 
 
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        ("== 1 failed, 10 passed in 3.00s ==", "more than passed tests"),
+        (
+            "PytestAssertRewriteWarning: Module already imported\n== 11 passed, 1 warning in 3.00s ==",
+            "more than passed",
+        ),
+        ("== 11 passed in 3.00s ==", "tests that passed left"),
+    ],
+)
+def test_what_is_no_clean_pass(folder: Path, said: str, why: str) -> None:
+    (folder / ".mavsitl-logs" / "a-test").mkdir(parents=True)
+    with pytest.raises(steps.StepError, match=why):
+        steps.passes(said, folder)
+
+
+def test_a_command_that_does_not_end_is_ended_with_what_it_started(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(steps, "PATIENCE_S", 0.2)
+    with pytest.raises(steps.StepError, match=r"not at its end after 0\.2 s"):
+        steps.run(["bash", "-c", "sleep 1000 & sleep 1000"], folder)
+
+
 @pytest.mark.sockets
 def test_a_project_of_a_users(folder: Path) -> None:
     wheels = steps.build(folder / "wheels", steps.ROOT, steps.PROJECT, isolated=False)
