@@ -15,12 +15,13 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from math import inf
 from pathlib import Path
@@ -73,6 +74,14 @@ def listening(port: int) -> Iterator[Any]:
         yield link
     finally:
         link.close()
+
+
+def silent_until(link: Any, started: Callable[[], bool]) -> None:
+    """Until our vehicle has been started. Raises `StepError` for a word before, which is of another vehicle."""
+    while not started():
+        if select.select([link.port], [], [], 0.02)[0] and not started():
+            _, sender = link.port.recvfrom(2048)
+            raise StepError(f"another vehicle, at {sender[0]}:{sender[1]}, sends to our port: end it first")
 
 
 class Station(NamedTuple):
@@ -211,8 +220,12 @@ def first_report(walk: Walk) -> list[tuple[str, float]]:
 
 
 def ready_vehicle(walk: Walk, port: int = LISTENED_PORT) -> list[tuple[str, float]]:
+    last = len(walk.parts) - 1
     with listening(port) as link, walk.running() as process:
         try:
+            silent_until(link, lambda: process.poll() is not None or len(walk.times()) == last)
+            if process.poll() is not None:
+                raise StepError("no vehicle has been started")
             found = station(link)
         except StepError as error:
             raise StepError(f"{error}; exit code {process.poll()}\n{walk.output()}") from error

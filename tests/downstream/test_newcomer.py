@@ -51,6 +51,21 @@ def test_a_port_that_is_taken_is_told() -> None:
 
 
 @pytest.mark.sockets
+def test_another_vehicle_is_not_taken_for_ours() -> None:
+    with newcomer.listening(0) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        newcomer.silent_until(link, lambda: True)
+        other.sendto(b"a word", ("127.0.0.1", link.port.getsockname()[1]))
+        with pytest.raises(StepError, match=r"another vehicle, at 127\.0\.0\.1:"):
+            newcomer.silent_until(link, lambda: False)
+
+
+def test_a_command_that_fails_starts_no_vehicle(tmp_path: Path) -> None:
+    walk = newcomer.Walk(["true", "false", "true"], tmp_path / "walk", str(tmp_path / "pip"))
+    with pytest.raises(StepError, match="no vehicle has been started; exit code 1"):
+        newcomer.ready_vehicle(walk, port=0)
+
+
+@pytest.mark.sockets
 def test_the_station_gets_parameters_and_a_mission() -> None:
     from pymavlink import mavutil
 
