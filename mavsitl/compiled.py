@@ -6,7 +6,7 @@ together).
 
 Numba's cache does not notice a change in a function that a cached function calls. The cache therefore lives in a folder
 named by a digest of every source file of the packages and modules that compile: a changed text never meets a stale
-cache.
+cache, and the same text in another environment meets this one (`mavsitl.kernel_cache`).
 """
 
 from __future__ import annotations
@@ -67,12 +67,13 @@ def _import_numba() -> Any:
 
 def _set_up_cache() -> None:
     numba = _import_numba()
-
-    import platformdirs
-
     if "NUMBA_CACHE_DIR" not in os.environ:
-        folder = platformdirs.user_cache_path("mavsitl") / "compiled" / _source_digest()
-        numba.config.CACHE_DIR = str(folder)
+        import platformdirs
+
+        from mavsitl import kernel_cache
+
+        name = f"{_source_digest()}-numba-{numba.__version__}"
+        kernel_cache.set_up(platformdirs.user_cache_path("mavsitl") / "compiled" / name)
 
 
 def compiled(function: F) -> F:

@@ -1,0 +1,1 @@
+"""Hold a place in wind, and survey one."""
