@@ -34,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mavsitl import quaternion
-from mavsitl.errors import UsageError
+from mavsitl.errors import UsageError, did_you_mean
 from mavsitl.scenario import Flight
 
 Vector: TypeAlias = npt.NDArray[np.float64]
@@ -250,8 +250,11 @@ def _place(name: str) -> _Place:
         raise ControllerError(f"{name}: which controller of that file? Needed: FILE.py:NAME; {offered}")
     points = installed()
     if name not in points:
-        known = ", ".join(dict.fromkeys((*PAPER, *sorted(points))))
-        raise ControllerError(f"{name!r} is no controller; allowed: {known}, FILE.py:NAME or MODULE:NAME")
+        known = tuple(dict.fromkeys((*PAPER, *sorted(points))))
+        raise ControllerError(
+            f"{name!r} is no controller; {did_you_mean(name, known)}allowed: {', '.join(known)}, "
+            "FILE.py:NAME or MODULE:NAME"
+        )
     return _Place(points[name].module, points[name].attr)
 
 

@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if run is None:
             parser.print_help()
             return EXIT_USAGE
-        called = f"{parser.prog} {options.command}"
+        called = " ".join(filter(None, (parser.prog, options.command, getattr(options, "log_command", None))))
         process.one_blas_thread()
         return run(options)
     except KeyboardInterrupt as interrupt:
