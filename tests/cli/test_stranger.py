@@ -120,6 +120,31 @@ def test_nobody_says_that_it_runs_before_it_has_its_port(command: str, capsys: p
     assert "Ctrl-C ends it" not in said.out
 
 
+# --- a controller with a mistake in it ---------------------------------------------------------------------------------
+
+WRONG = """\
+import numpy as np
+
+
+class Mine:
+    def update(self, time_s, state, reference):
+        return np.linalg.inv(np.zeros((3, 3)))  # fails in NumPy's own code
+"""
+
+
+def test_a_mistake_in_a_controller_is_its_line_and_no_success(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text(WRONG)
+    run = tmp_path / "run"
+    flown = ["fly", "hover-wind", "--in-memory", "--controller", f"{tmp_path / 'mine.py'}:Mine"]
+    assert main([*flown, "--run-dir", str(run)]) == 1
+    said = capsys.readouterr().out
+    assert "LinAlgError: Singular matrix (mine.py, line 6)" in said
+    assert said.count("lost \N{BLACK UP-POINTING TRIANGLE}") == 6  # not "0.00", as of six numbers that were beaten
+    assert ": 0 of 6 states at or below" in (run / "report.html").read_text()
+
+
 # --- a narrow terminal ------------------------------------------------------------------------------------------------
 
 
