@@ -120,7 +120,7 @@ def test_nobody_says_that_it_runs_before_it_has_its_port(command: str, capsys: p
     assert "Ctrl-C ends it" not in said.out
 
 
-# --- a controller with a mistake in it ---------------------------------------------------------------------------------
+# --- a controller with a mistake in it --------------------------------------------------------------------------------
 
 WRONG = """\
 import numpy as np
