@@ -61,6 +61,17 @@ def test_a_pipe_gets_no_escape_at_all(tmp_path: Path) -> None:
     assert "\x1b" not in said.stdout + said.stderr
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+@pytest.mark.parametrize("arguments", [["scenarios"], ["scenarios", "--json"]])
+def test_a_full_disk_is_a_line_and_no_traceback(arguments: list[str]) -> None:
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-m", "mavsitl", *arguments], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert ended.returncode == 1
+    assert ended.stderr == "mavsitl scenarios: output cannot be written: No space left on device\n"
+
+
 # --- a wrong word -----------------------------------------------------------------------------------------------------
 
 
