@@ -32,8 +32,9 @@ start here:
   mavsitl COMMAND --help     what a command takes, with examples
 
 Exit codes: 0 done; 1 the run failed (the message says which end and why) or a vehicle was lost; 2 wrong arguments,
-scenario or path; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by the terminal's end. A vehicle or a ground in real time runs
-until it is told to end: for these two a signal is the end, and 0. However it ends, logs and state are complete.
+scenario or path; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by the terminal's end. A vehicle or a ground in real
+time runs until it is told to end: for these two a signal is the end, and 0. However it ends, logs and state are
+complete.
 """
 
 

@@ -113,7 +113,7 @@ def _fly_fleet(options: argparse.Namespace, flights: list[Flight]) -> int:
     from mavsitl.clock import utc_stamp
 
     if len(flights) != 1:
-        raise UsageError(f"--count: one scenario, not {len(flights)}")
+        raise UsageError(f"--count: name one scenario, such as formation-spiral; {len(flights)} were to fly")
     (flight,) = flights
     folder = run_folder(options.run_dir, utc_stamp())
     title = f"{flight.name}, {options.count} vehicles"

@@ -82,6 +82,8 @@ def test_a_full_disk_is_a_line_and_no_traceback(arguments: list[str]) -> None:
         (["fly", "hover-wind", "--set", "controller.law=pidn"], "law: 'pidn' is not allowed; did you mean pidnn, pid?"),
         (["fly", "hover-wind", "--set", 'wind=[{model="gst"}]'], ".model: 'gst' is not allowed; did you mean gust?"),
         (["fly", "hover-wind", "--controller", "geometrc"], "did you mean geometric? allowed: pidnn, pid, "),
+        (["fly", "hover-wind", "--set", "wind.speed=3"], "unknown key; did you mean speed_20ft_m_s? allowed here: "),
+        (["fly", "--count", "3"], "--count: name one scenario, such as formation-spiral; 4 were to fly"),
         (["fly", "nowhere.toml"], "nowhere.toml: no such file; a name without .toml is one of the shipped scenarios"),
         (["fly", "--duration", "long"], "--duration: 'long' is not allowed; allowed: a finite number above 0"),
         (["fly", "--seed", "-1"], "--seed: '-1' is not allowed; allowed: a whole number from 0"),
