@@ -20,6 +20,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
+import sysconfig
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mavsitl import quaternion
-from mavsitl.errors import UsageError
+from mavsitl.errors import UsageError, did_you_mean
 from mavsitl.scenario import Flight
 
 Vector: TypeAlias = npt.NDArray[np.float64]
@@ -250,8 +251,11 @@ def _place(name: str) -> _Place:
         raise ControllerError(f"{name}: which controller of that file? Needed: FILE.py:NAME; {offered}")
     points = installed()
     if name not in points:
-        known = ", ".join(dict.fromkeys((*PAPER, *sorted(points))))
-        raise ControllerError(f"{name!r} is no controller; allowed: {known}, FILE.py:NAME or MODULE:NAME")
+        known = tuple(dict.fromkeys((*PAPER, *sorted(points))))
+        raise ControllerError(
+            f"{name!r} is no controller; {did_you_mean(name, known)}allowed: {', '.join(known)}, "
+            "FILE.py:NAME or MODULE:NAME"
+        )
     return _Place(points[name].module, points[name].attr)
 
 
@@ -347,10 +351,16 @@ def failure(what: str, error: Exception) -> ControllerError:
         for frame in traceback.extract_tb(error.__traceback__)
         if frame.filename not in _NOT_THEIRS and not frame.filename.startswith("<frozen")
     ]
-    at = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    own = [frame for frame in frames if not _of_a_library(Path(frame.filename))] or frames
+    at = f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
     lines = [*traceback.format_list(frames), *traceback.format_exception_only(error)]
     trace = "Traceback (most recent call last):\n" + "".join(lines).rstrip() if frames else ""
     return ControllerError(f"{what}: {type(error).__name__}: {error}{at}", trace)
+
+
+def _of_a_library(file: Path) -> bool:
+    """Whether it came with Python or by pip: where the user has nothing to mend."""
+    return any(file.is_relative_to(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))
 
 
 _NOT_THEIRS = {__file__, importlib.__file__}

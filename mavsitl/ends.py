@@ -397,17 +397,21 @@ def _open_links(links: VehicleLinks, hint: str = "") -> list[Link]:
     return opened
 
 
+def _nobody_is_told() -> None:
+    """For who does not want to know when the ports are taken."""
+
+
 def vehicle_realtime(
     flight: Flight, links: VehicleLinks, folder: Path | None, *,
     system_id: int, wing: str | None, speed: float, until_finished: bool, state: Path | None,
     report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
-    wish: realtime.Wish = realtime.Wish.ORDINARY,
+    wish: realtime.Wish = realtime.Wish.ORDINARY, bound: Callable[[], None] = _nobody_is_told,
 ) -> Outcome:  # fmt: skip
     """The vehicle on the wall clock, with PX4 SITL's two links and TCP where asked for.
 
     `state` is the folder of what outlives the process, None: nothing does. `report` is told what went wrong on the
     machine, and so are the links: logs that cannot be written any more, real time that was not kept. `wish`: of the
-    system, see `mavsitl.realtime`.
+    system, see `mavsitl.realtime`. `bound` is called when the ports are taken, before anything is compiled.
     Raises as `vehicle_lockstep`, and `RealTimeError`.
     """
     realtime.check(wish)
@@ -421,6 +425,7 @@ def vehicle_realtime(
 
     try:
         opened += _open_links(links)
+        bound()
         live = _LiveLinks(opened, flight, speed)
         with ExitStack() as stack:
             # A vehicle that misbehaves does so from its first word: nobody speaks for it.
@@ -469,16 +474,18 @@ def ground_realtime(
     vehicle_system_id: int | None, wing: str | None,
     report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
     wish: realtime.Wish = realtime.Wish.ORDINARY, monitor: Address | None = None,
+    bound: Callable[[], None] = _nobody_is_told,
 ) -> Outcome:  # fmt: skip
     """The ground on the wall clock, on any endpoint. `monitor`: where it tells what it knows, see `mavsitl.monitor`.
 
-    Raises as `vehicle_realtime`.
+    `bound` and raises as `vehicle_realtime`.
     """
     realtime.check(wish)
     with ExitStack() as stack:
         link = open_link(address, port_option="--link udpin:HOST:PORT", host_option="--link udpin:HOST:PORT")
         stack.callback(link.close)
         beside = stack.enter_context(_monitor(monitor))
+        bound()
         recorder, tap = stack.enter_context(
             _logs(folder, "ground", flight, lambda error: report(f"logging has ended: {error}"))
         )
@@ -586,12 +593,12 @@ def fleet_realtime(
     flight: Flight, links: Sequence[VehicleLinks], folder: Path | None, *,
     count: int, system_id: int, wing: str | None, speed: float, until_finished: bool, states: Sequence[Path | None],
     report: Callable[[str], None], stop: Callable[[], bool], progress: Progress | None,
-    wish: realtime.Wish = realtime.Wish.ORDINARY,
+    wish: realtime.Wish = realtime.Wish.ORDINARY, bound: Callable[[], None] = _nobody_is_told,
 ) -> FleetOutcome:  # fmt: skip
     """`count` vehicles on the wall clock in this process. `links`: each one's, or those that all are behind.
 
     `folder` gets the logs of each in a folder ``vehicle-<instance>``, the instance being its system id less 1; `states`
-    are what each keeps. Raises as `vehicle_realtime`.
+    are what each keeps. `bound` and raises as `vehicle_realtime`.
     """
     from mavsitl import seeds  # here, for it loads numpy
 
@@ -614,6 +621,7 @@ def fleet_realtime(
             group = _open_links(each, " or --instance I")
             opened.append(group)
             stack.callback(_close_all, group)  # the list, for its elements are replaced
+        bound()
         folders = [_fleet_folder(folder, system_id - 1 + j) for j in range(count)]
         unix_clock = _steady_unix_clock()
         logs = [
@@ -711,9 +719,9 @@ def ground_fleet(
     flight: Flight, addresses: Sequence[Address], folder: Path | None, *,
     count: int, first_system_id: int, wing: str | None,
     report: Callable[[str], None], stop: Callable[[], bool], wish: realtime.Wish = realtime.Wish.ORDINARY,
-    monitor: Address | None = None,
+    monitor: Address | None = None, bound: Callable[[], None] = _nobody_is_told,
 ) -> FleetOutcome:  # fmt: skip
-    """`count` controllers on the wall clock, each on its endpoint or all on one. `monitor` and raises as
+    """`count` controllers on the wall clock, each on its endpoint or all on one. `monitor`, `bound` and raises as
     `ground_realtime`.
     """
     realtime.check(wish)
@@ -725,6 +733,7 @@ def ground_fleet(
             opened.append(open_link(address, port_option=option, host_option="--link udpin:HOST:PORT"))
 
         beside = stack.enter_context(_monitor(monitor))
+        bound()
 
         def failed(error: LogError) -> None:
             report(f"logging has ended: {error}")

@@ -28,11 +28,13 @@ class UsageError(MavsitlError, ValueError):
 def did_you_mean(name: str, names: Iterable[str], before: str = "") -> str:
     """Of the names that exist those that look like the one that does not, as ``did you mean A, B? ``; empty: none does.
 
-    With `before` in front the text stands at the end: ``; did you mean A, B?``.
+    With `before` in front the text stands at the end: ``; did you mean A, B?``. A name whose end was left out, as its
+    unit, looks like it too.
     """
     from difflib import get_close_matches
 
-    near = get_close_matches(name, list(names))
+    known = list(names)
+    near = get_close_matches(name, known) or [each for each in known if len(name) > 2 and each.startswith(name)]
     if not near:
         return ""
     text = f"did you mean {', '.join(near)}?"

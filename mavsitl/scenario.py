@@ -608,8 +608,12 @@ def _read(kind: str, name_or_path: str, shipped: list[str], folder: Path | None 
         )
     try:
         return path.read_text("utf-8"), str(path), path.parent
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: cannot be read: {error}") from error
+    except FileNotFoundError as error:
+        raise ScenarioError(f"{path}: no such file; a name without .toml is one of the shipped {kind}") from error
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path}: not UTF-8 text, as TOML is: {error}") from error
 
 
 def _parse(text: str, where: str) -> dict[str, Any]:
@@ -696,7 +700,8 @@ def _problems(data: Any, info: msgspec.inspect.Type, path: str) -> Iterator[str]
                 else:
                     allowed = ", ".join(f"'{name}'" for name in tags)
                     found = f"{_shown(tag)} is not allowed" if field in data else "missing"
-                    yield f"{_join(path, field)}: {found}; allowed: {allowed}"
+                    meant = did_you_mean(tag, [str(name) for name in tags]) if isinstance(tag, str) else ""
+                    yield f"{_join(path, field)}: {found}; {meant}allowed: {allowed}"
             elif len(options) == 1:
                 yield from _problems(data, options[0], path)
             else:
@@ -706,7 +711,8 @@ def _problems(data: Any, info: msgspec.inspect.Type, path: str) -> Iterator[str]
             allowed_keys = [*([info.tag_field] if info.tag_field else []), *fields]
             for key, value in data.items():
                 if key not in allowed_keys:
-                    yield f"{_join(path, key)}: unknown key; allowed here: {', '.join(allowed_keys)}"
+                    meant = did_you_mean(key, allowed_keys)
+                    yield f"{_join(path, key)}: unknown key; {meant}allowed here: {', '.join(allowed_keys)}"
                 elif key in fields:
                     yield from _problems(value, fields[key].type, _join(path, key))
             for key, struct_field in fields.items():
@@ -735,7 +741,9 @@ def _problems(data: Any, info: msgspec.inspect.Type, path: str) -> Iterator[str]
         case _:
             fits = False
     if not fits:
-        yield f"{path}: {_shown(data)} is not allowed; allowed: {describe(info)}"
+        names = [str(value) for value in info.values] if isinstance(info, msgspec.inspect.LiteralType) else []
+        meant = did_you_mean(data, names) if isinstance(data, str) else ""
+        yield f"{path}: {_shown(data)} is not allowed; {meant}allowed: {describe(info)}"
 
 
 def describe(info: msgspec.inspect.Type) -> str:

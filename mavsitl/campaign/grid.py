@@ -230,8 +230,9 @@ def parse_seeds(text: str) -> tuple[int, ...]:
         if found and alone and found[2] is None:
             first = 1
         if not first <= last < first + MOST:
-            raise GridError(f"{text}: {piece.strip() or 'nothing'} is not allowed; allowed: {SEEDS_ALLOWED}")
+            where = "" if alone else f" {text}"
+            raise GridError(f"seeds{where}: {piece.strip()!r} is not allowed; allowed: {SEEDS_ALLOWED}")
         seeds += range(first, last + 1)
     if len(set(seeds)) != len(seeds):
-        raise GridError(f"{text}: a seed is there twice")
+        raise GridError(f"seeds {text}: one is there twice")
     return tuple(seeds)

@@ -61,7 +61,6 @@ class Silent(Mode):
 
     def __init__(self, seconds: float, *, mute: bool, deaf: bool) -> None:
         self._us = round(seconds * 1e6)
-        self._mute, self._deaf = mute, deaf
         self._until_us: int | None = None
         self.gives = None if mute else frozenset()
         self.takes = None if deaf else frozenset()

@@ -7,6 +7,7 @@ flights), `screen` (what a person sees). A command's module says what is asked a
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import signal
 import sys
@@ -30,9 +31,10 @@ start here:
   mavsitl check              is one there, and does it answer?
   mavsitl COMMAND --help     what a command takes, with examples
 
-Exit codes: 0 done; 1 the run failed (the message says which end and why) or a vehicle was lost; 2 wrong arguments or
-scenario; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by the terminal's end. A vehicle or a ground in real time runs
-until it is told to end: for these two a signal is the end, and 0. However it ends, logs and state are complete.
+Exit codes: 0 done; 1 the run failed (the message says which end and why) or a vehicle was lost; 2 wrong arguments,
+scenario or path; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by the terminal's end. A vehicle or a ground in real
+time runs until it is told to end: for these two a signal is the end, and 0. However it ends, logs and state are
+complete.
 """
 
 
@@ -49,20 +51,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if run is None:
             parser.print_help()
             return EXIT_USAGE
-        called = f"{parser.prog} {options.command}"
+        called = " ".join(filter(None, (parser.prog, options.command, getattr(options, "log_command", None))))
         process.one_blas_thread()
         return run(options)
     except KeyboardInterrupt as interrupt:
         code = EXIT_SIGNAL + (interrupt.number if isinstance(interrupt, Interrupted) else signal.SIGINT)
         return _tell(called, "interrupted", interrupt, code, as_json=_for_a_program(given))
-    except BrokenPipeError:
-        # The reader of our output went away; point stdout elsewhere so that the interpreter's last flush is quiet.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader of our output went away
+        _silence()
         return EXIT_FAILED
     except MavsitlError as error:
         if isinstance(error, ParseError):
             called = error.prog
         return _tell(called, f"{error}", error, error.exit_code, as_json=_for_a_program(given))
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        _silence()
+        return _tell(called, f"output cannot be written: {error.strerror}", error, EXIT_FAILED, as_json=False)
+
+
+def _silence() -> None:
+    """Point stdout elsewhere, so that the interpreter's last flush does not fail once more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _for_a_program(arguments: Sequence[str]) -> bool:

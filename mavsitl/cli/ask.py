@@ -17,6 +17,7 @@ from mavsitl.cli.common import (
     command,
     not_negative,
     print_json,
+    share,
     whole,
 )
 from mavsitl.errors import did_you_mean
@@ -104,7 +105,7 @@ def add_link(commands: Any) -> None:
         ("--corrupt", "P", "share with flipped bits"),
         ("--bandwidth", "KBIT_S", "0: unlimited"),
     ):
-        group.add_argument(option, type=not_negative, metavar=metavar, help=text)
+        group.add_argument(option, type=share if metavar == "P" else not_negative, metavar=metavar, help=text)
     group.add_argument("--direction", choices=tuple(LINK_DIRECTIONS), help="for which all of these hold")
     outage = group.add_mutually_exclusive_group()
     outage.add_argument("--down", dest="down", action="store_const", const=1.0, help="nothing comes through")
@@ -130,7 +131,12 @@ def add_param(commands: Any) -> None:
     parser = command(
         commands, "param", "read and set parameters of a running vehicle", PARAM_HELP, PARAM_EXAMPLES + ASK_EPILOG
     )
-    parser.add_argument("action", choices=("get", "set", "list"), help="list: all, or those that match a pattern")
+    parser.add_argument(
+        "action",
+        choices=("get", "set", "list"),
+        metavar="{get,set,list}",
+        help="list: all, or what matches a pattern",
+    )
     parser.add_argument("names", nargs="*", metavar="NAME[=VALUE]", help="with list a pattern such as 'SIM_*'")
     _add_ask_options(parser, "udpout:127.0.0.1:18570 + I")
     parser.set_defaults(run=_param)

@@ -195,7 +195,8 @@ def _show(console: Console, plan: Plan, board: Board) -> None:
     table.add_row("lost", *(f"[bold red]{each.lost}[/]" if each.lost else "0" for each in board.standings))
     console.print(table)
     flights = board.standings[0].flights
-    console.print(f"100 is as good as the cascade aboard (stock), more is better; {flights} flights each", style="dim")
+    each = "1 flight each" if flights == 1 else f"{flights} flights each"
+    console.print(f"100 is as good as the cascade aboard (stock), more is better; {each}", style="dim")
 
 
 def _shipped() -> tuple[str, ...]:

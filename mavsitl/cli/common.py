@@ -126,6 +126,7 @@ def _number(allowed: Callable[[float], bool], said: str) -> Callable[[str], floa
 above_zero = _number(lambda value: value > 0.0, " above 0")
 not_negative = _number(lambda value: value >= 0.0, ", 0 or more")
 at_least_1 = _number(lambda value: value >= 1.0, ", 1 or more")
+share = _number(lambda value: 0.0 <= value <= 1.0, " from 0 to 1")
 
 
 def speed_factor(text: str) -> float:
@@ -137,6 +138,9 @@ def speed_factor(text: str) -> float:
 
 PORT = whole(0, 65535)
 
+LARGEST_SEED = 2**63 - 1
+"""TOML's integers end there."""
+
 SYSTEM = whole(1, 255)
 
 
@@ -144,7 +148,9 @@ def add_scenario_options(parser: argparse.ArgumentParser, *, seed: bool = True) 
     """`seed`: False for a command that flies many seeds."""
     group = parser.add_argument_group("scenario")
     if seed:
-        group.add_argument("--seed", type=int, metavar="N", help="seed of wind and noise (scenario key: seed)")
+        group.add_argument(
+            "--seed", type=whole(0, LARGEST_SEED), metavar="N", help="seed of wind and noise (scenario key: seed)"
+        )
     group.add_argument("--airframe", metavar="NAME", help="paper, realistic, full-coupling or a .toml file (airframe)")
     group.add_argument("--law", choices=("pidnn", "pid"), help="attitude law (controller.law)")
     group.add_argument("--level", choices=("attitude", "body_rate", "torque"), help="command level (controller.level)")
@@ -153,7 +159,7 @@ def add_scenario_options(parser: argparse.ArgumentParser, *, seed: bool = True) 
         choices=("oracle", "observer", "none"),
         help="source of W1..W3 (controller.wind_information)",
     )
-    group.add_argument("--duration", type=float, metavar="S", help="flight time in seconds (duration_s)")
+    group.add_argument("--duration", type=above_zero, metavar="S", help="flight time in seconds (duration_s)")
     group.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
         help="any key of the scenario, dotted, with a TOML value; may be repeated",

@@ -186,11 +186,12 @@ def _dropped(outcome: Outcome | FleetOutcome) -> list[str]:
 
 
 def _links(whose: str, links: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
-    """A line for each direction of each bad link: its counts that are not 0."""
+    """A line for each direction of each bad link on which anything was sent: its counts that are not 0."""
     return [
         f"{whose}{place} {direction}: " + ", ".join(f"{name} {value:g}" for name, value in counts.items() if value)
         for place, directions in links.items()
         for direction, counts in directions.items()
+        if any(counts.values())
     ]
 
 

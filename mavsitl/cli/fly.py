@@ -113,7 +113,7 @@ def _fly_fleet(options: argparse.Namespace, flights: list[Flight]) -> int:
     from mavsitl.clock import utc_stamp
 
     if len(flights) != 1:
-        raise UsageError(f"--count: one scenario, not {len(flights)}")
+        raise UsageError(f"--count: name one scenario, such as formation-spiral; {len(flights)} were to fly")
     (flight,) = flights
     folder = run_folder(options.run_dir, utc_stamp())
     title = f"{flight.name}, {options.count} vehicles"
@@ -188,7 +188,7 @@ def _show(console: Console, options: argparse.Namespace, folder: Path, records: 
     lost = []
     for record in records:
         data = FlightData.from_folder(folder / record.folder, duration_s=record.duration_s)
-        results.append((record, tables.rows(rmse(data), record.paper_case)))
+        results.append((record, tables.rows(rmse(data), record.paper_case, lost=bool(record.lost))))
         if record.lost:
             said = f"{record.name} was lost after {data.time_s[-1]:.1f} s: {record.lost}"
             lost.append(f"{said}\nlook at: mavsitl log info {folder / record.folder}")
@@ -223,7 +223,7 @@ def _show_flight(console: Console, record: FlightRecord, rows: list[Row]) -> Non
         cells = [row.state, tables.number(row.ours)]
         if row.paper is not None and row.ratio is not None and row.verdict is not None:
             style = {"beaten": "green", "met": "green", "missed": "yellow"}[row.verdict]
-            cells += [tables.number(row.paper), f"[{style}]{row.ratio:.2f} {tables.SYMBOLS[row.verdict]}[/]"]
+            cells += [tables.number(row.paper), f"[{style}]{tables.ratio(row.ratio)} {tables.SYMBOLS[row.verdict]}[/]"]
         table.add_row(*cells)
     console.print(table)
     for link in tables.link_rows(record.links):

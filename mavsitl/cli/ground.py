@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mavsitl import process
@@ -125,11 +126,11 @@ def _ground(options: argparse.Namespace) -> int:
             report=status.say, progress=status.progress,
         )  # fmt: skip
     else:
-        status.start(f"ground ({flight.name}): waiting for a vehicle on {address}; Ctrl-C ends it")
+        text = f"ground ({flight.name}): waiting for a vehicle on {address}; Ctrl-C ends it"
         outcome = ends.ground_realtime(
             flight, address, options.run_dir,
             vehicle_system_id=options.system, wing=options.wing, report=status.say, stop=status.stop, progress=None,
-            wish=wish, monitor=monitor,
+            wish=wish, monitor=monitor, bound=partial(status.start, text),
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED
@@ -157,13 +158,13 @@ def _ground_fleet(
     ]
     status = Status(options.status == "json", options.run_dir)
     where = first if links == 1 else f"{first} to {addresses[-1]}"
-    status.start(
+    text = (
         f"ground ({flight.name}): waiting for vehicles {system_id} to {system_id + count - 1} on {where}; "
         "Ctrl-C ends it"
     )
     outcome = ends.ground_fleet(
         flight, addresses, options.run_dir, count=count, first_system_id=system_id, wing=options.wing,
-        report=status.say, stop=status.stop, wish=wish, monitor=monitor,
+        report=status.say, stop=status.stop, wish=wish, monitor=monitor, bound=partial(status.start, text),
     )  # fmt: skip
     status.end_fleet(outcome)
     return EXIT_OK if outcome.finished or status.stopped else EXIT_FAILED

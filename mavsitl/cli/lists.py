@@ -7,8 +7,8 @@ from typing import Any
 
 from mavsitl.cli.common import EXIT_OK, add_json, command, print_json
 
-WIDE = 100
-"""Columns of a terminal from which on a scenario's command level is listed, too."""
+LEAST_WIDTH = {"level": 100, "airframe": 90, "reference": 76}
+"""Columns of a terminal from which on this is listed of a scenario, too: its title is more worth."""
 
 CHAOS_HELP = """\
 List what mavsitl vehicle --chaos makes the vehicle do wrong, for tests of ground stations and SDKs: acknowledgements
@@ -43,15 +43,15 @@ def _scenarios(options: argparse.Namespace) -> int:
     from mavsitl.cli import screen
 
     console = screen.console()
-    columns = ["scenario", "title", "airframe", "wind", "reference", "level"]
-    if console.width < WIDE:
-        columns.pop()
+    names = ("scenario", "title", "airframe", "wind", "reference", "level")
+    columns = [name for name in names if console.width >= LEAST_WIDTH.get(name, 0)]
     table = screen.table(*columns, whole=set(columns) - {"title"})
     for flight in flights:
         s = flight.scenario
         wind = " + ".join(str(model.__struct_config__.tag) for model in s.wind) or "calm"
-        cells = (flight.name, s.title, s.airframe, wind, str(s.reference.__struct_config__.tag), s.controller.level)
-        table.add_row(*cells[: len(columns)])
+        reference = str(s.reference.__struct_config__.tag)
+        cells = dict(zip(names, (flight.name, s.title, s.airframe, wind, reference, s.controller.level), strict=True))
+        table.add_row(*(cells[name] for name in columns))
     console.print(table)
     return EXIT_OK
 

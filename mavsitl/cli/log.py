@@ -21,6 +21,9 @@ EXIT_DIFFER = 1
 SHOWN = 10
 """Columns of a topic, parameters or texts that are listed of a difference."""
 
+WIDE = 80
+"""Columns of a terminal from which on it is listed when a topic begins and ends; --json always has it."""
+
 HELP = """\
 What is in a log, a log in another format, and where two flights part. LOG is a ULog (.ulg), a tlog, or the folder of a
 run; docs/howto/logs.md says with what else they open.
@@ -127,15 +130,14 @@ def _show(console: Console, info: LogInfo, *, all_parameters: bool) -> None:
         for source in info.sources:
             sources.add_row(*(str(each) for each in (source.system, source.component, source.frames, source.lost)))
         console.print(sources)
-    what, numbers = (
-        "topic" if info.kind == "ULog" else "message",
-        ("rows", "Hz", "longest gap / s", "from / s", "to / s"),
-    )
+    what = "topic" if info.kind == "ULog" else "message"
+    numbers = ["rows", "Hz", "longest gap / s", *(["from / s", "to / s"] if console.width >= WIDE else [])]
     table = screen.table(what, *numbers, right=numbers, whole=(what,))
     for topic in info.topics:
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.4g}"
         gap = "" if topic.longest_gap_s is None else f"{topic.longest_gap_s:.3f}"
-        table.add_row(topic.name, str(topic.rows), rate, gap, f"{topic.first_s:.3f}", f"{topic.last_s:.3f}")
+        cells = (str(topic.rows), rate, gap, f"{topic.first_s:.3f}", f"{topic.last_s:.3f}")
+        table.add_row(topic.name, *cells[: len(numbers)])
     console.print(table)
     if info.dropouts_s:
         console.print(f"dropouts: {info.dropouts_s:.3f} s")

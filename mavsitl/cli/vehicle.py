@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -170,20 +171,25 @@ def _vehicle(options: argparse.Namespace) -> int:
             progress=status.progress,
         )
     else:
-        status.start(
+        text = (
             f"vehicle {system_id} ({flight.name}): off-board {links.bind}:{links.offboard_port} -> {offboard_remote}, "
             f"ground station {links.bind}:{links.gcs_port} -> {links.gcs_remote[0]}:{links.gcs_remote[1]}; "
             "Ctrl-C ends it"
         )
-        for window in flight.scenario.chaos:
-            status.say(f"misbehaves: {window.mode} on port {window.port}")
         outcome = ends.vehicle_realtime(
             flight, links, options.run_dir, system_id=system_id, wing=options.wing, speed=options.speed or 1.0,
             until_finished=bool(options.until_disarmed), state=_state_folder(options, system_id),
             report=status.say, stop=status.stop, progress=None, wish=wish,
+            bound=partial(_tell_start, status, flight, text),
         )  # fmt: skip
     status.end(outcome)
     return EXIT_OK
+
+
+def _tell_start(status: Status, flight: Flight, text: str) -> None:
+    status.start(text)
+    for window in flight.scenario.chaos:
+        status.say(f"misbehaves: {window.mode} on port {window.port}")
 
 
 def _with_chaos(flight: Flight, modes: Sequence[str]) -> Flight:
@@ -245,17 +251,16 @@ def _fleet(
             raise UsageError(f"{name}: {count} vehicles would need ports up to {used}; allowed: up to 65535")
     status = Status(options.status == "json", options.run_dir)
     where = "all on one link" if options.one_link else "each further one's ports 1 higher"
-    status.start(
+    text = (
         f"vehicles {system_id} to {system_id + count - 1} ({flight.name}): "
         f"off-board {first.bind}:{first.offboard_port} -> {host}:{port}, ground station {first.bind}:{first.gcs_port} "
         f"-> {first.gcs_remote[0]}:{first.gcs_remote[1]}, {where}; Ctrl-C ends it"
     )
-    for window in flight.scenario.chaos:
-        status.say(f"misbehaves: {window.mode} on port {window.port}")
     outcome = ends.fleet_realtime(
         flight, links, options.run_dir, count=count, system_id=system_id, wing=options.wing,
         speed=options.speed or 1.0, until_finished=bool(options.until_disarmed),
         states=_fleet_states(options, system_id, count), report=status.say, stop=status.stop, progress=None, wish=wish,
+        bound=partial(_tell_start, status, flight, text),
     )  # fmt: skip
     status.end_fleet(outcome)
     return EXIT_OK

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from mavsitl.log.errors import LogError
+from mavsitl.log.errors import LogError, NoLogError
 from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
 from mavsitl.log.topics import Topic
 from mavsitl.log.ulog import MAGIC, read_ulog
@@ -74,7 +74,7 @@ def logs_of(path: Path) -> tuple[Path, ...]:
     """
     if not path.is_dir():
         if not path.exists():
-            raise LogError(f"{path}: no such file or folder")
+            raise NoLogError(f"{path}: no such file or folder")
         return (path,)
     found = tuple(path / name for name in RUN_LOGS if (path / name).is_file())
     if found:
@@ -83,8 +83,8 @@ def logs_of(path: Path) -> tuple[Path, ...]:
     if len(flights) == 1:
         return logs_of(flights[0])
     if flights:
-        raise LogError(f"{path}: a run of several flights; allowed: {', '.join(str(each) for each in flights)}")
-    raise LogError(f"{path}: a folder without logs; expected {', '.join(RUN_LOGS)}, or a run with them in a folder")
+        raise NoLogError(f"{path}: a run of several flights; allowed: {', '.join(str(each) for each in flights)}")
+    raise NoLogError(f"{path}: a folder without logs; expected {', '.join(RUN_LOGS)}, or a run with them in a folder")
 
 
 def load(path: Path) -> Content:
@@ -101,7 +101,7 @@ def load(path: Path) -> Content:
         return _load_ulog(path, size)
     if len(head) > _STAMP.size and head[_STAMP.size] in _MAVLINK:
         return _load_tlog(path, size)
-    raise LogError(f"{path}: neither a ULog nor a tlog")
+    raise NoLogError(f"{path}: neither a ULog nor a tlog")
 
 
 def joined(path: Path) -> Content:
@@ -191,7 +191,7 @@ def _load_tlog(path: Path, size: int) -> Content:
         known = received[kind]
         known.rows.append((_STAMP.unpack_from(data, at)[0], *sender, *(getattr(message, name) for name in known.names)))
     if not received:
-        raise LogError(f"{path}: neither a ULog nor a tlog: no MAVLink frame in it is whole")
+        raise NoLogError(f"{path}: neither a ULog nor a tlog: no MAVLink frame in it is whole")
     return Content(
         path=path,
         kind="tlog",

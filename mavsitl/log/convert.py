@@ -18,7 +18,7 @@ import numpy as np
 
 from mavsitl.log.content import Content, Table, flat, joined
 from mavsitl.log.endings import ENDINGS, ONE_TOPIC
-from mavsitl.log.errors import LogError
+from mavsitl.log.errors import LogError, NoLogError
 
 
 def convert(source: Path, out: Path, topics: Sequence[str] = ()) -> tuple[str, ...]:
@@ -32,10 +32,10 @@ def convert(source: Path, out: Path, topics: Sequence[str] = ()) -> tuple[str, .
     content = joined(source)
     missing = [key for key in topics if key not in content.tables]
     if missing:
-        raise LogError(f"{source}: no topic {', '.join(missing)}; there are {', '.join(sorted(content.tables))}")
+        raise NoLogError(f"{source}: no topic {', '.join(missing)}; there are {', '.join(sorted(content.tables))}")
     chosen = {key: table for key, table in content.tables.items() if not topics or key in topics}
     if ending in ONE_TOPIC and len(chosen) != 1:
-        raise LogError(
+        raise NoLogError(
             f"{out}: holds one topic, and there are {len(chosen)}: choose by --topic NAME, or name it "
             f"{out.stem}{out.suffix}.zip, which holds a file of each"
         )
@@ -48,7 +48,7 @@ def _ending(out: Path) -> str:
     for ending in ENDINGS:
         if out.name.endswith(ending) and out.name != ending:
             return ending
-    raise LogError(f"{out}: its ending says the format; allowed: {', '.join(ENDINGS)}")
+    raise NoLogError(f"{out}: its ending says the format; allowed: {', '.join(ENDINGS)}")
 
 
 @contextmanager

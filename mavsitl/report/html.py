@@ -108,7 +108,9 @@ def write_report(run_folder: Path) -> Path:
 def show(record: FlightRecord, data: FlightData) -> Shown:
     """A flight measured."""
     rmse = metrics.rmse(data)
-    return Shown(record, data, rmse, metrics.maximum_error(data), tables.rows(rmse, record.paper_case))
+    return Shown(
+        record, data, rmse, metrics.maximum_error(data), tables.rows(rmse, record.paper_case, lost=bool(record.lost))
+    )
 
 
 def render(run: Run, flights: list[Shown]) -> str:
@@ -138,6 +140,7 @@ def template(name: str) -> Template:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(read)
     )
     environment.filters["number"] = tables.number
+    environment.filters["ratio"] = tables.ratio
     return environment.get_template(name)
 
 

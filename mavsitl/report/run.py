@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 
 import mavsitl
-from mavsitl.errors import MavsitlError
+from mavsitl.errors import EXIT_USAGE, MavsitlError
 from mavsitl.keep import replace_json
 from mavsitl.report.metrics import PAPER_TABLES, paper_case
 from mavsitl.scenario import Controller, Flight
@@ -19,6 +19,12 @@ RUN_FILE = "run.json"
 
 class RunError(MavsitlError, ValueError):
     """A run's folder is not as it should be; the message names the file and what was expected."""
+
+
+class NoRunError(RunError):
+    """What was named is no run's folder."""
+
+    exit_code = EXIT_USAGE
 
 
 class FlightRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -123,7 +129,7 @@ def load_run(folder: Path) -> Run:
     try:
         data = path.read_bytes()
     except FileNotFoundError as error:
-        raise RunError(f"{path}: not found; expected the folder of a run, with {RUN_FILE} in it") from error
+        raise NoRunError(f"{path}: not found; expected the folder of a run, with {RUN_FILE} in it") from error
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or error}") from error
     try:

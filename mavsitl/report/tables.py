@@ -24,14 +24,18 @@ class Row:
     ours: float
     paper: float | None
     ratio: float | None
+    """Infinite for a flight that was lost: what it did before says nothing."""
     verdict: Verdict | None
 
 
-def rows(ours: Rmse, paper_case: str | None) -> list[Row]:
-    """Six rows, x to psi. `paper_case` is a key of `PAPER_TABLES`, or None. Raises KeyError for another."""
+def rows(ours: Rmse, paper_case: str | None, *, lost: bool = False) -> list[Row]:
+    """Six rows, x to psi. `paper_case` is a key of `PAPER_TABLES`, or None. Raises KeyError for another.
+
+    `lost`: the vehicle was, and `ours` is of the time before.
+    """
     theirs = PAPER_TABLES[paper_case].values() if paper_case is not None else (None,) * 6
     return [
-        _row(f"{label} / {unit}", mine, paper)
+        _row(f"{label} / {unit}", mine, paper, lost=lost)
         for label, unit, mine, paper in zip(LABELS, UNITS, ours.values(), theirs, strict=True)
     ]
 
@@ -97,9 +101,16 @@ def number(value: float) -> str:
     return f"{value:#.3g}" if 1e-3 <= abs(value) < 100.0 else f"{value:.2e}"
 
 
-def _row(state: str, ours: float, paper: float | None) -> Row:
+def ratio(value: float) -> str:
+    """Of our number to the paper's; ``lost`` for a flight that was."""
+    return "lost" if value == inf else f"{value:.2f}"
+
+
+def _row(state: str, ours: float, paper: float | None, *, lost: bool) -> Row:
     if paper is None:
         return Row(state, ours, None, None, None)
+    if lost:
+        return Row(state, ours, paper, inf, "missed")
     # The paper prints three or four digits: closer than half of the last of three is the same number.
     if abs(ours - paper) <= 5e-4 * paper:
         verdict: Verdict = "met"

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mavsitl.dialect import mavlink
 from mavsitl.log import topics
-from mavsitl.log.errors import LogError
+from mavsitl.log.errors import LogError, NoLogError
 from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
 from mavsitl.log.topics import Topic
 from mavsitl.log.ulog import read
@@ -64,10 +64,10 @@ def find_flights(path: Path) -> list[Recorded]:
     if found is not None:
         return [found]
     if not path.is_dir():
-        raise LogError(f"{path}: no such folder; expected that of a run, with {RUN_FILE} or {VEHICLE_LOG} in it")
+        raise NoLogError(f"{path}: no such folder; expected that of a run, with {RUN_FILE} or {VEHICLE_LOG} in it")
     below = [flight for entry in sorted(path.iterdir()) if entry.is_dir() and (flight := _flight(entry)) is not None]
     if not below:
-        raise LogError(f"{path}: nothing to replay; expected {RUN_FILE}, {VEHICLE_LOG} or a fleet's vehicle-0 in it")
+        raise NoLogError(f"{path}: nothing to replay; expected {RUN_FILE}, {VEHICLE_LOG} or a fleet's vehicle-0 in it")
     return below
 
 

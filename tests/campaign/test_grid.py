@@ -130,7 +130,7 @@ def test_a_grid_is_every_combination_with_every_seed() -> None:
 
 def test_a_grid_is_checked_as_a_whole() -> None:
     for text, message in (
-        ("controller.lawn=pid,pidnn", "controller.lawn: unknown key; allowed here: law, level,"),
+        ("controller.lawn=pid,pidnn", "controller.lawn: unknown key; did you mean law? allowed here: law, level,"),
         ("controller.law=pid,lqr", "controller.law: 'lqr' is not allowed; allowed: 'pid', 'pidnn'"),
     ):
         with pytest.raises(ScenarioError) as refusal:

@@ -86,13 +86,13 @@ def test_the_ground_stations_link_is_spoken_to_over_the_other_one(asked: Asked) 
 
 def test_a_refusal_is_exit_1_and_names_the_endpoint(asked: Asked, capsys: pytest.CaptureFixture[str]) -> None:
     asked.problem = "vehicle 1 refuses"
-    assert main(["link", "--loss", "3"]) == 1
+    assert main(["link", "--loss", "0.3"]) == 1
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.endswith("mavsitl link: udpout:127.0.0.1:18570: vehicle 1 refuses\n")
     assert main(["link", "--gcs", "--down", "--endpoint", "udpout:127.0.0.1:18570"]) == 1
     assert "over --endpoint udpout:127.0.0.1:14580 it has" in capsys.readouterr().err
-    assert main(["link", "--loss", "3", "--json"]) == 1
+    assert main(["link", "--loss", "0.3", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["problem"].endswith("refuses")
 
 
@@ -152,7 +152,7 @@ def test_wrong_arguments_are_exit_2(
 
 def test_a_negative_loss_is_no_loss(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["link", "--loss", "-1"]) == 2
-    assert "a finite number, 0 or more" in capsys.readouterr().err
+    assert "a finite number from 0 to 1" in capsys.readouterr().err
 
 
 class Late(MemoryLink):

@@ -141,11 +141,11 @@ MISTAKES: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "unknown command": (["land"], ("'land'", "fly")),
     "unknown option": (["fly", "--fast"], ("--fast",)),
     "unknown scenario": (["fly", "hover-clam"], ("hover-clam", "hover-calm", "spiral-wind", ".toml")),
-    "missing file": (["fly", "none.toml"], ("none.toml", "No such file")),
+    "missing file": (["fly", "none.toml"], ("none.toml", "no such file")),
     "bad law": (["fly", "--law", "lqr"], ("--law", "'lqr'", "pidnn", "pid")),
-    "bad seed": (["fly", "--seed", "-1"], ("seed", "-1", "whole number >= 0")),
+    "bad seed": (["fly", "--seed", "-1"], ("--seed", "'-1'", "whole number from 0")),
     "seed not a number": (["fly", "--seed", "x"], ("--seed", "'x'")),
-    "duration": (["fly", "--duration", "nan"], ("duration_s", "nan", "number > 0")),
+    "duration": (["fly", "--duration", "nan"], ("--duration", "'nan'", "finite number above 0")),
     "airframe": (["fly", "--airframe", "boat"], ("boat", "paper", "realistic")),
     "set without value": (["fly", "--set", "seed"], ("--set seed", "KEY=VALUE")),
     "set of nothing": (["fly", "--set", "=3"], ("--set =3", "KEY=VALUE")),
@@ -308,7 +308,7 @@ def test_fly_leaves_run_logs_and_report(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_report_of_a_folder_that_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, said = usage(["report", str(tmp_path)], capsys)
-    assert code == 1
+    assert code == 2
     assert "run.json" in said
     assert "not found" in said
 

@@ -49,7 +49,7 @@ def test_convert_says_what_it_wrote(run: Path, tmp_path: Path, capsys: pytest.Ca
     assert main(["log", "convert", str(run), str(out), "--topic", "wind_groundtruth", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said == {"out": str(out), "bytes": out.stat().st_size, "topics": ["wind_groundtruth"]}
-    assert main(["log", "convert", str(run), str(tmp_path / "a.xml")]) == 1
+    assert main(["log", "convert", str(run), str(tmp_path / "a.xml")]) == 2
     assert "its ending says the format" in capsys.readouterr().err
 
 

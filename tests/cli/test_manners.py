@@ -104,9 +104,9 @@ def test_every_command_speaks_json(command: str, capsys: pytest.CaptureFixture[s
         (["fly", "--json", "hover-clam"], 2, "hover-clam: no such shipped file"),
         (["vehicle", "--status", "json", "hover-clam"], 2, "hover-clam: no such shipped file"),
         (["ground", "--status=json", "--link", "14540"], 2, "'14540' is not an endpoint"),
-        (["sweep", "hover-calm", "--json", "--seeds", "x"], 2, "x is not allowed"),
-        (["tune", "hover-calm", "--json", "--seeds", "x"], 2, "x is not allowed"),
-        (["report", "--json", "/nonexistent"], 1, "run.json"),
+        (["sweep", "hover-calm", "--json", "--seeds", "x"], 2, "seeds: 'x' is not allowed"),
+        (["tune", "hover-calm", "--json", "--seeds", "x"], 2, "seeds: 'x' is not allowed"),
+        (["report", "--json", "/nonexistent"], 2, "run.json"),
         (["check", "--json", "--listen", "14540"], 2, "'14540' is not an endpoint"),
     ],
 )

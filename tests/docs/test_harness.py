@@ -140,6 +140,6 @@ def test_blocks_of_a_page_see_one_another(tmp_path: Path) -> None:
 def test_the_exit_code_that_is_said_is_the_one_that_is_right(tmp_path: Path) -> None:
     run = PageRun(tmp_path)
     lost = "mavsitl report nothing-here"
-    run.run(blocks.Block("p.md", 1, "sh", lost, {"exit": "1"}))
-    with pytest.raises(BlockError, match="exit code 1"):
+    run.run(blocks.Block("p.md", 1, "sh", lost, {"exit": "2"}))
+    with pytest.raises(BlockError, match="exit code 2"):
         run.run(blocks.Block("p.md", 1, "sh", lost))

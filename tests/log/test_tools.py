@@ -76,11 +76,13 @@ def test_mavexplorer_s_graphs(run: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     from pymavlink import mavutil
 
     graph = grapher.MavGraph()
-    graph.add_mav(mavutil.mavlink_connection(str(run / "link.tlog")))
+    tlog = mavutil.mavlink_connection(str(run / "link.tlog"))
+    graph.add_mav(tlog)
     fields = ("degrees(ATTITUDE.roll)", "ODOMETRY.z", "sqrt(LOCAL_POSITION_NED.vx**2+LOCAL_POSITION_NED.vy**2)")
     for field in fields:
         graph.add_field(field)
     graph.process([], [], 0)
+    tlog.close()
     tables = load(run / "link.tlog").tables
     np.testing.assert_allclose(graph.y[0], np.degrees(tables["ATTITUDE"]["roll"]))
     np.testing.assert_array_equal(graph.y[1], tables["ODOMETRY"]["z"])

@@ -60,6 +60,12 @@ def test_the_rows_of_the_comparison() -> None:
     assert {(row.paper, row.ratio, row.verdict) for row in tables.rows(ours, None)} == {(None, None, None)}
 
 
+def test_a_flight_that_was_lost_is_not_better_than_the_paper() -> None:
+    """However small its errors were until then."""
+    rows = tables.rows(Rmse(*[1e-6] * 6), "hover-wind", lost=True)
+    assert {(row.ours, tables.ratio(row.ratio or 0.0), row.verdict) for row in rows} == {(1e-6, "lost", "missed")}
+
+
 @pytest.mark.parametrize(
     ("value", "text"),
     [(0.1, "0.100"), (1.099, "1.10"), (123.4, "123"), (0.00849, "0.00849"), (2e-5, "2.00e-05"), (float("nan"), "nan")],

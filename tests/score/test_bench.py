@@ -119,7 +119,7 @@ def test_the_page_has_every_case_and_controller_and_nothing_from_elsewhere(mine:
         ({"wanted": [], "programs": ["a {url}", "a {url}"]}, "two are called 'a'"),
         ({"wanted": [], "programs": ["stock=a {url}"]}, "two are called 'stock'"),
         ({"wanted": [], "pattern": "x"}, "no case of suite 1 is called so"),
-        ({"wanted": [], "seeds": "x"}, "x is not allowed; allowed: N for 1 to N"),
+        ({"wanted": [], "seeds": "x"}, "seeds: 'x' is not allowed; allowed: N for 1 to N"),
     ],
 )
 def test_what_cannot_be_flown_is_said_before_anything_flies(arguments: dict[str, Any], said: str) -> None:

@@ -136,7 +136,7 @@ def test_a_failure_of_the_link_itself_acts_on_it() -> None:
 @pytest.mark.parametrize(
     ("wrong", "error", "told"),
     [
-        (lambda f: f.inject("motr"), ScenarioError, "faults.inject: unit: 'motr' is not allowed; allowed: 'accel'"),
+        (lambda f: f.inject("motr"), ScenarioError, "faults.inject: unit: 'motr' is not allowed; did you mean motor"),
         (lambda f: f.inject("motor", "delayed"), FaultError, "motor delayed is not supported; allowed: 0 ok"),
         (lambda f: f.inject("motor", instance=5), FaultError, "motor has no instance 5"),
         (lambda f: f.inject("motor", "wrong", value=2.0), FaultError, "2 is not allowed for motor wrong"),

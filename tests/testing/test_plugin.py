@@ -263,7 +263,7 @@ def test_a_scenario_of_ones_own(run: Run, pytester: pytest.Pytester) -> None:
         ("scenario=3", "vehicle", "*scenario=3): allowed: a shipped scenario's name, *"),
         ("scenaro='hover-wind'", "vehicle", f"*scenaro=...): allowed: {', '.join(MARKER)}"),
         ("'hover-wind'", "vehicle", f"*takes names alone: {', '.join(MARKER)}"),
-        ("overrides={'noise.position': 1}", "flight", "*noise.position: unknown key; allowed here: position_m, *"),
+        ("overrides={'noise.position': 1}", "flight", "*noise.position: unknown key; did you mean position_m? *"),
         ("overrides='x'", "flight", "*overrides='x'): allowed: a dict *"),
         ("seed='x'", "flight", "*seed=...): 'x' is not allowed; allowed: a whole number"),
         ("seed=1.5", "flight", "*seed=...): 1.5 is not allowed; allowed: a whole number"),

@@ -263,7 +263,7 @@ def test_a_file_of_ones_own_keeps_its_airframe_and_waypoints(tmp_path: Path) -> 
         (("--tune", "controller.position.kp=1:2"), "controller.position has no 'kp'"),
         (("--evaluations", "0"), "'0' is not allowed"),
         (("--no-worse", "0.9"), "'0.9' is not allowed; allowed: a finite number, 1 or more"),
-        (("--against", "me"), "invalid choice: 'me'"),
+        (("--against", "me"), "--against: 'me' is not allowed; allowed: paper, start"),
         (("--seeds", "7-9", "--held-out", "9"), "seed 7 is in both"),
         (("--set", "controller.law=lqr"), "controller.law: 'lqr' is not allowed"),
     ],
