@@ -769,10 +769,27 @@ def fleet_in_memory(
             tap.flush = _both(tap.flush, ground_tap.flush)
         started_us = monotonic_us()
         end_us = fleet.fly_in_memory(core, core.vehicles, formation, taps, progress=progress)
+        wall_us = monotonic_us() - started_us
         flown = tuple(
             replace(each, wire_hash=tap.wire.hexdigest()) for each, tap in zip(formation.flown(), taps, strict=True)
         )
-        return _fleet_outcome(core, end_us, monotonic_us() - started_us, flown)
+        if flight.scenario.fleet.on_collision == "crash":
+            flown = _crashed(flown, core.collisions)
+        return _fleet_outcome(core, end_us, wall_us, flown)
+
+
+def _crashed(flown: Sequence[Flown], collisions: Sequence[fleet.Collision]) -> tuple[Flown, ...]:
+    """Who has collided is lost, wherever the pieces came down; the ground need not have seen it."""
+    first: dict[int, str] = {}
+    for each in collisions:
+        for system_id, other in ((each.vehicle, each.other), (each.other, each.vehicle)):
+            first.setdefault(system_id, f"collided with vehicle {other} at t = {each.time_s:.2f} s")
+    return tuple(
+        replace(each, finished=False, lost="; ".join(filter(None, (first[each.system_id], each.lost))))
+        if each.system_id in first
+        else each
+        for each in flown
+    )
 
 
 def _both(one: Callable[[], None] | None, other: Callable[[], None] | None) -> Callable[[], None]:

@@ -23,7 +23,7 @@ from mavsitl.log.topics import Topic
 from mavsitl.log.ulog import read
 from mavsitl.px4_modes import NAV_STATES
 from mavsitl.quaternion import from_euler
-from mavsitl.report.run import RUN_FILE, load_run
+from mavsitl.report.run import RUN_FILE, FlightRecord, load_run
 from mavsitl.services.statustext import printable
 from mavsitl.view.model import ROW_INTERVAL_US, ROWS, Model, Row, Vehicle, put_link, row_of, shorten
 
@@ -57,7 +57,7 @@ def find_flights(path: Path) -> list[Recorded]:
         flights = load_run(path).flights
         titles = [flight.title for flight in flights]
         return [
-            Recorded(title if titles.count(title) == 1 else f"{title} ({flight.folder})", {1: path / flight.folder})
+            Recorded(title if titles.count(title) == 1 else f"{title} ({flight.folder})", _folders(path, flight))
             for title, flight in zip(titles, flights, strict=True)
         ]
     found = _flight(path)
@@ -69,6 +69,12 @@ def find_flights(path: Path) -> list[Recorded]:
     if not below:
         raise LogError(f"{path}: nothing to replay; expected {RUN_FILE}, {VEHICLE_LOG} or a fleet's vehicle-0 in it")
     return below
+
+
+def _folders(run: Path, flight: FlightRecord) -> dict[int, Path]:
+    if flight.fleet is None:
+        return {1: run / flight.folder}
+    return {vehicle.system_id: run / vehicle.folder for vehicle in flight.fleet.vehicles}
 
 
 def _flight(folder: Path) -> Recorded | None:
