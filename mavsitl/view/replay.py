@@ -5,7 +5,6 @@ Sans-IO but for the files, which are read once.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan
@@ -17,6 +16,7 @@ import numpy.typing as npt
 
 from mavsitl.dialect import mavlink
 from mavsitl.log import topics
+from mavsitl.log.content import VEHICLE_FOLDER
 from mavsitl.log.errors import LogError
 from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
 from mavsitl.log.topics import Topic
@@ -43,9 +43,6 @@ class Recorded:
 
     name: str
     folders: Mapping[int, Path]
-
-
-_FLEET = re.compile(r"vehicle-([0-9]{1,3})")
 
 
 def find_flights(path: Path) -> list[Recorded]:
@@ -85,7 +82,7 @@ def _flight(folder: Path) -> Recorded | None:
     fleet = {
         int(match[1]) + 1: entry
         for entry in folder.iterdir()
-        if (match := _FLEET.fullmatch(entry.name)) and (entry / VEHICLE_LOG).is_file()
+        if (match := VEHICLE_FOLDER.fullmatch(entry.name)) and (entry / VEHICLE_LOG).is_file()
     }
     return Recorded(folder.resolve().name, dict(sorted(fleet.items()))) if fleet else None
 
