@@ -7,7 +7,7 @@ import inspect
 import ipaddress
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from math import inf
@@ -27,7 +27,7 @@ from mavsitl.link.settings import PLACES
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
 from mavsitl.log.errors import Failed, LogError
 from mavsitl.log.tlog import TlogWriter
-from mavsitl.scenario import Flight, LinkModel, ScenarioError
+from mavsitl.scenario import Flight, LinkModel
 
 if TYPE_CHECKING:
     from mavsitl.ask import Reply, Task
@@ -97,13 +97,14 @@ IMPAIRED_GRACE_S = 300.0
 """Over an impaired link a flight in lock-step that takes so much longer than its scenario says will never end."""
 
 
-def lockstep_channels(flight: Flight) -> Channels | None:
-    """Of the off-board link in lock-step; None where each tick is answered."""
+def lockstep_channels(flight: Flight, vehicle: int = 0) -> Channels | None:
+    """Of the off-board link in lock-step, of that vehicle of a fleet; None where each tick is answered."""
     if not flight.scenario.impaired:
         return None
-    from mavsitl.link.impaired import Channels  # here, for it loads numpy
+    from mavsitl import seeds  # here, for these load numpy
+    from mavsitl.link.impaired import Channels
 
-    return Channels(flight.scenario.link, flight.scenario.seed)
+    return Channels(flight.scenario.link, seeds.of_vehicle(flight.scenario.seed, vehicle))
 
 
 def _watch_lockstep_link(core: Any, channels: Channels | None, recorder: Recorder, tap: Tap) -> None:
@@ -647,6 +648,7 @@ def fleet_realtime(
                 polled=lambda: ports.polled(lives), speed=speed, until_finished=until_finished,
                 stop=stop, say=report, progress=progress,
             )  # fmt: skip
+        _record_links((tap for _, tap in logs), timing.simulated_us)
         flown = tuple(
             Flown(
                 vehicle.system_id, vehicle.succeeded,
@@ -656,6 +658,13 @@ def fleet_realtime(
             for j, vehicle in enumerate(core.vehicles)
         )  # fmt: skip
         return _fleet_outcome(core, timing.simulated_us, monotonic_us() - started_us, flown, timing=timing)
+
+
+def _record_links(taps: Iterable[Tap], now_us: int) -> None:
+    """The last row of each: what the links did in all."""
+    for tap in taps:
+        if tap.record is not None:
+            tap.record(now_us)
 
 
 def _close_all(links: list[Link]) -> None:
@@ -748,12 +757,7 @@ def ground_fleet(
 def fleet_in_memory(
     flight: Flight, folder: Path | None, *, count: int, report: Callable[[str], None], progress: Progress | None
 ) -> FleetOutcome:
-    """A fleet and its controllers in this process, in lock-step.
-
-    Raises `ScenarioError` for links that are not perfect.
-    """
-    if flight.scenario.impaired:
-        raise ScenarioError(f"{flight.name}: link, chaos: a fleet in memory has perfect links; allowed: absent")
+    """A fleet and its controllers in this process, in lock-step; each pair has a link of its own."""
     with ExitStack() as stack:
         folders = [_fleet_folder(folder, j) for j in range(count)]
         vehicle_logs = [stack.enter_context(_logs(each, "vehicle", flight)) for each in folders]
@@ -767,11 +771,25 @@ def fleet_in_memory(
         taps = [tap for _, tap in vehicle_logs]
         for tap, (_, ground_tap) in zip(taps, ground_logs, strict=True):
             tap.flush = _both(tap.flush, ground_tap.flush)
+        channels = [lockstep_channels(flight, j) for j in range(count)]
+        for vehicle, own, (recorder, tap) in zip(core.vehicles, channels, vehicle_logs, strict=True):
+            _watch_lockstep_link(vehicle, own, recorder, tap)
         started_us = monotonic_us()
-        end_us = fleet.fly_in_memory(core, core.vehicles, formation, taps, progress=progress)
+        end_us = fleet.fly_in_memory(
+            core, core.vehicles, formation, taps, progress=progress,
+            channels=[each for each in channels if each is not None],
+            max_time_s=flight.scenario.duration_s + IMPAIRED_GRACE_S if flight.scenario.impaired else inf,
+        )  # fmt: skip
         wall_us = monotonic_us() - started_us
+        _record_links(taps, end_us)
         flown = tuple(
-            replace(each, wire_hash=tap.wire.hexdigest()) for each, tap in zip(formation.flown(), taps, strict=True)
+            replace(
+                each,
+                finished=each.finished and vehicle.finished,
+                wire_hash=tap.wire.hexdigest(),
+                link=_statistics(own),
+            )
+            for each, vehicle, tap, own in zip(formation.flown(), core.vehicles, taps, channels, strict=True)
         )
         if flight.scenario.fleet.on_collision == "crash":
             flown = _crashed(flown, core.collisions)

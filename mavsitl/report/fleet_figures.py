@@ -211,14 +211,16 @@ def _links(vehicles: Sequence[VehicleRecord]) -> Drawing:
     def draw(figure: Figure) -> None:
         for index, label in enumerate(("lost and in outages / %", "delay p99 / ms")):
             axes: Any = figure.add_axes((0.085 + 0.5 * index, 0.18, 0.4, 0.68))
+            highest = 0.0
             for name, colour in zip(names, _COLOURS, strict=False):
                 mine = [(system_id, row) for system_id, row in rows if row.link == name]
                 values = [row.delay_p99_ms if index else 100.0 * (row.lost + row.outage) for _, row in mine]
+                highest = max(highest, *values)
                 axes.plot([each for each, _ in mine], values, "o", markersize=3.5, color=colour, label=name)
             axes.set_xlabel("vehicle")
             axes.set_ylabel(label)
-            axes.set_ylim(bottom=0.0)
+            axes.set_ylim(0.0, 1.1 * highest or 1.0)
             axes.xaxis.get_major_locator().set_params(integer=True)
         _legend(figure, axes)
 
-    return Drawing(svg(draw, 2.9, "links", _WHOLE_IN), "Each vehicle's link over the whole run", "")
+    return Drawing(svg(draw, 2.9, "links", _WHOLE_IN), "Each vehicle’s links over the whole run", "")

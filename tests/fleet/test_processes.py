@@ -133,7 +133,6 @@ def test_in_memory_a_formation_flies_the_same_bytes_again(tmp_path: Path, capsys
         (["ground", "--count", "2", "--lockstep"], "--count: not with --lockstep"),
         (["ground", "--count", "2", "--link", "udpin:127.0.0.1:65535"], "would need ports up to 65536"),
         (["fly", "hover-calm", "hover-wind", "--count", "2"], "--count: one scenario, not 2"),
-        (["fly", "hover-calm", "--count", "2", "--set", "link.live=true"], "a fleet in memory has perfect links"),
     ],
 )  # fmt: skip
 def test_what_does_not_go_together_is_refused(
