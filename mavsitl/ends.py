@@ -426,7 +426,7 @@ def vehicle_realtime(
         with ExitStack() as stack:
             # A vehicle that misbehaves does so from its first word: nobody speaks for it.
             boot = None if flight.scenario.chaos else wings.find_boot(wing)
-            with Herald(boot, system_id, opened) as herald:
+            with Herald(boot, {system_id: opened}) as herald:
                 unix_clock = _steady_unix_clock()
                 recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight, log_failed, boot_us=unix_clock()))
                 build = wings.find(wings.VEHICLE_GROUP, wing)
@@ -594,8 +594,6 @@ def fleet_realtime(
     `folder` gets the logs of each in a folder ``vehicle-<instance>``, the instance being its system id less 1; `states`
     are what each keeps. Raises as `vehicle_realtime`.
     """
-    from mavsitl import seeds  # here, for it loads numpy
-
     realtime.check(wish)
 
     one_link = len(links) < count
@@ -615,19 +613,31 @@ def fleet_realtime(
             group = _open_links(each, " or --instance I")
             opened.append(group)
             stack.callback(_close_all, group)  # the list, for its elements are replaced
+        scenario = flight.scenario
+        # Nor over links that are impaired: those begin with the vehicles' clock, when all are built.
+        silent = scenario.chaos or scenario.link != LinkModel() or scenario.gcs_link != LinkModel()
+        boot = None if silent else wings.find_boot(wing)
+        speakers = {system_id + j: opened[0 if one_link else j] for j in range(count)}
         folders = [_fleet_folder(folder, system_id - 1 + j) for j in range(count)]
-        unix_clock = _steady_unix_clock()
-        logs = [
-            stack.enter_context(_logs(each, "vehicle", flight, log_failed, boot_us=unix_clock())) for each in folders
-        ]
-        core = _many(
-            wings.find(wings.VEHICLE_GROUP, wing), flight, [recorder for recorder, _ in logs], count=count,
-            seed=flight.scenario.seed, system_id=system_id, one_link=one_link,
-            ports=("offboard", *["gcs"] * (len(opened[0]) - 1)), states=states, logs=folders,
-            unix_us=unix_clock, trusted=is_loopback(links[0].bind),
-        )  # fmt: skip
+        with Herald(boot, speakers) as herald:
+            unix_clock = _steady_unix_clock()
+            logs = [
+                stack.enter_context(_logs(each, "vehicle", flight, log_failed, boot_us=unix_clock()))
+                for each in folders
+            ]
+            core = _many(
+                wings.find(wings.VEHICLE_GROUP, wing), flight, [recorder for recorder, _ in logs], count=count,
+                seed=flight.scenario.seed, system_id=system_id, one_link=one_link,
+                ports=("offboard", *["gcs"] * (len(opened[0]) - 1)), states=states, logs=folders,
+                unix_us=unix_clock, trusted=is_loopback(links[0].bind),
+            )  # fmt: skip
+        if herald.sequence:
+            for vehicle in core.vehicles:
+                vehicle.continue_from(herald.sequence)
         per_group = len(opened[0])
         ports = _Ports(opened)
+        from mavsitl import seeds  # here, for it loads numpy
+
         lives = []
         for j, group in enumerate(opened):
             vehicle = core.vehicles[j]
