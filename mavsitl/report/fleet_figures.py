@@ -21,7 +21,9 @@ ALL_POINTS = 24_000
 """Of a figure, shared by its vehicles."""
 LEAST_POINTS = 100
 FEW = 10
-"""So many vehicles have colours that are told apart, and names; of more every few are named."""
+"""So many vehicles have colours that are told apart, and names."""
+NAMED = 5
+"""Of more so many are named."""
 _COLOURS = (
     "#2166ac", "#d6604d", "#1b7837", "#762a83", "#bf812d", "#35978f", "#c51b7d", "#4d4d4d", "#7fbc41", "#6baed6"
 )  # fmt: skip
@@ -50,7 +52,7 @@ def colours(count: int) -> list[Any]:
 def _lines(tracks: Tracks) -> Iterator[tuple[int, Track, Any, str | None]]:
     """(column, track, colour, name in the legend) of the vehicles that have flown."""
     count = len(tracks.vehicles)
-    named = range(count) if count <= FEW else np.linspace(0, count - 1, 5).astype(int).tolist()
+    named = range(count) if count <= FEW else np.linspace(0, count - 1, NAMED).astype(int).tolist()
     for column, (track, colour) in enumerate(zip(tracks.vehicles, colours(count), strict=True)):
         if track.time_s.size:
             yield column, track, colour, f"vehicle {track.system_id}" if column in named else None
@@ -84,8 +86,8 @@ def _legend(figure: Figure, axes: Any, columns: int = 6) -> None:
 
 
 def _top_margin(figure: Figure, count: int, columns: int = 6) -> float:
-    """The axes' upper end, as a share of the figure's height, under a legend of the vehicles and one name more."""
-    rows = -(-(min(count, FEW) + 1) // columns)
+    """The axes' upper end, as a share of the figure's height, under a legend of the vehicles and one or two names."""
+    rows = -(-(count + 1 if count <= FEW else NAMED + 2) // columns)
     return 1.0 - (0.18 + 0.22 * rows) / float(figure.get_size_inches()[1])
 
 

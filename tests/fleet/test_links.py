@@ -89,14 +89,23 @@ def test_a_perfect_link_is_what_it_was_without_one() -> None:
     assert fly(scenario, 2).vehicles[0].wire_hash == hash_in_memory(scenario)
 
 
-def test_a_vehicle_without_its_ground_is_one_that_has_not_flown_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not an error that takes the others' flights with it."""
+def test_a_vehicle_without_its_ground_is_one_that_has_not_flown_to_its_end(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not an error that takes the others' flights with it; here nobody ever meets."""
     monkeypatch.setattr(ends, "IMPAIRED_GRACE_S", 5.0)
-    silent = {"link.to_vehicle.down": True, "link.to_ground.down": True}
-    outcome = fly(shortened("formation-spiral", 1.0, **silent), 2)
-    assert [each.finished for each in outcome.vehicles] == [False, False]
-    assert outcome.simulated_s == pytest.approx(6.0, abs=0.1)
-    assert not outcome.finished
+    silent = ["--set", "link.to_vehicle.down=true", "--set", "link.to_ground.down=true"]
+    arguments = ["fly", "formation-spiral", "--count", "2", "--duration", "1", "--json", "--run-dir", str(tmp_path)]
+    assert main([*arguments, *silent]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert [each["finished"] for each in told["vehicles"]] == [False, False]
+    assert told["simulated_s"] == pytest.approx(6.0, abs=0.1)
+    assert not told["finished"]
+    vehicles = told["flights"][0]["flight"]["fleet"]["vehicles"]
+    assert [(each["flight_time_s"], each["rms_m"]) for each in vehicles] == [(0.0, None)] * 2
+    page = (tmp_path / "report.html").read_text("utf-8")
+    assert page.count("not flown to its end") == 2
+    assert "0 of 2 flown as planned" in page
 
 
 def test_chaos_acts_on_every_vehicle() -> None:
