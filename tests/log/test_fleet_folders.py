@@ -25,6 +25,12 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def _wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows and paths are not broken, whatever terminal the tests run on."""
+    monkeypatch.setenv("COLUMNS", "300")
+
+
 def vehicles(fleet: Path) -> tuple[Path, ...]:
     return tuple(fleet / "formation-spiral" / f"vehicle-{j}" for j in range(COUNT))
 
