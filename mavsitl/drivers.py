@@ -256,7 +256,7 @@ def fly_in_memory(
     tap = tap or Tap()
     throttle = _Throttle(progress)
     if channels is not None:
-        return _fly_impaired(vehicle, channels, _in_memory(ground), tap, max_time_s, throttle)
+        return _fly_impaired(vehicle, channels, ground_in_memory(ground), tap, max_time_s, throttle)
     now_us, period_us, last_us = 0, vehicle.period_us, max_time_s * 1e6
     ground_us = chores_us = 0
     hear = tap.hear
@@ -310,10 +310,11 @@ def ticks_in_memory(
 
     Yields the time of each tick that is over, us. It has no limit but the two ends'. Raises as `fly_in_memory`.
     """
-    return _impaired_ticks(vehicle, channels, _in_memory(ground), tap or Tap())
+    return _impaired_ticks(vehicle, channels, ground_in_memory(ground), tap or Tap())
 
 
-def _in_memory(ground: GroundCore) -> Exchange:
+def ground_in_memory(ground: GroundCore) -> Exchange:
+    """The other side of an impaired link's exchanges, in this process."""
     turns = _GroundTurns(ground)
 
     def exchange(now_us: int, messages: list[bytes]) -> tuple[list[bytes], bool]:
@@ -348,26 +349,34 @@ def _impaired_ticks(vehicle: VehicleCore, channels: Channels, exchange: Exchange
     now_us, period_us = 0, vehicle.period_us
     while True:
         vehicle.step(now_us)
-        channels.fly(now_us, vehicle.flight_time_s)
-        for datagram in vehicle.datagrams(0, combine=True):
-            channels.to_ground.send(datagram, now_us)
-        messages = channels.to_ground.due(now_us, EXCHANGE_BYTES)
-        for message in messages:
-            tap.hear(FROM_VEHICLE, now_us, message)
-        answers, last = exchange(now_us, messages)
-        for answer in answers:
-            tap.hear(FROM_GROUND, now_us, answer)
-            channels.to_vehicle.send(answer, now_us)
-        for message in channels.to_vehicle.due(now_us):
-            vehicle.receive(0, message)
+        last = exchange_impaired(vehicle, vehicle.datagrams(0, combine=True), channels, exchange, tap, now_us)
         if last and not vehicle.finished:
             raise LockstepError(f"the ground ended at t = {now_us / 1e6:g} s and the vehicle has not disarmed")
-        if not last:
-            tap.tick(now_us)
         yield now_us
         if last:
             return
         now_us += period_us
+
+
+def exchange_impaired(
+    vehicle: VehicleCore, said: Sequence[bytes], channels: Channels, exchange: Exchange, tap: Tap, now_us: int
+) -> bool:
+    """What a tick of an impaired link is after the vehicle's step, in which it `said` this; whether it was the last."""
+    channels.fly(now_us, vehicle.flight_time_s)
+    for datagram in said:
+        channels.to_ground.send(datagram, now_us)
+    messages = channels.to_ground.due(now_us, EXCHANGE_BYTES)
+    for message in messages:
+        tap.hear(FROM_VEHICLE, now_us, message)
+    answers, last = exchange(now_us, messages)
+    for answer in answers:
+        tap.hear(FROM_GROUND, now_us, answer)
+        channels.to_vehicle.send(answer, now_us)
+    for message in channels.to_vehicle.due(now_us):
+        vehicle.receive(0, message)
+    if not last:
+        tap.tick(now_us)
+    return last
 
 
 class _Exchanges:

@@ -7,7 +7,7 @@ import inspect
 import ipaddress
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from math import inf
@@ -27,7 +27,7 @@ from mavsitl.link.settings import PLACES
 from mavsitl.link.udp import LOOPBACK, ConnectedUdp, UdpLink
 from mavsitl.log.errors import Failed, LogError
 from mavsitl.log.tlog import TlogWriter
-from mavsitl.scenario import Flight, LinkModel, ScenarioError
+from mavsitl.scenario import Flight, LinkModel
 
 if TYPE_CHECKING:
     from mavsitl.ask import Reply, Task
@@ -97,13 +97,14 @@ IMPAIRED_GRACE_S = 300.0
 """Over an impaired link a flight in lock-step that takes so much longer than its scenario says will never end."""
 
 
-def lockstep_channels(flight: Flight) -> Channels | None:
-    """Of the off-board link in lock-step; None where each tick is answered."""
+def lockstep_channels(flight: Flight, vehicle: int = 0) -> Channels | None:
+    """Of the off-board link in lock-step, of that vehicle of a fleet; None where each tick is answered."""
     if not flight.scenario.impaired:
         return None
-    from mavsitl.link.impaired import Channels  # here, for it loads numpy
+    from mavsitl import seeds  # here, for these load numpy
+    from mavsitl.link.impaired import Channels
 
-    return Channels(flight.scenario.link, flight.scenario.seed)
+    return Channels(flight.scenario.link, seeds.of_vehicle(flight.scenario.seed, vehicle))
 
 
 def _watch_lockstep_link(core: Any, channels: Channels | None, recorder: Recorder, tap: Tap) -> None:
@@ -430,7 +431,7 @@ def vehicle_realtime(
         with ExitStack() as stack:
             # A vehicle that misbehaves does so from its first word: nobody speaks for it.
             boot = None if flight.scenario.chaos else wings.find_boot(wing)
-            with Herald(boot, system_id, opened) as herald:
+            with Herald(boot, {system_id: opened}) as herald:
                 unix_clock = _steady_unix_clock()
                 recorder, tap = stack.enter_context(_logs(folder, "vehicle", flight, log_failed, boot_us=unix_clock()))
                 build = wings.find(wings.VEHICLE_GROUP, wing)
@@ -600,8 +601,6 @@ def fleet_realtime(
     `folder` gets the logs of each in a folder ``vehicle-<instance>``, the instance being its system id less 1; `states`
     are what each keeps. `bound` and raises as `vehicle_realtime`.
     """
-    from mavsitl import seeds  # here, for it loads numpy
-
     realtime.check(wish)
 
     one_link = len(links) < count
@@ -622,19 +621,31 @@ def fleet_realtime(
             opened.append(group)
             stack.callback(_close_all, group)  # the list, for its elements are replaced
         bound()
+        scenario = flight.scenario
+        # Nor over links that are impaired: those begin with the vehicles' clock, when all are built.
+        silent = scenario.chaos or scenario.link != LinkModel() or scenario.gcs_link != LinkModel()
+        boot = None if silent else wings.find_boot(wing)
+        speakers = {system_id + j: opened[0 if one_link else j] for j in range(count)}
         folders = [_fleet_folder(folder, system_id - 1 + j) for j in range(count)]
-        unix_clock = _steady_unix_clock()
-        logs = [
-            stack.enter_context(_logs(each, "vehicle", flight, log_failed, boot_us=unix_clock())) for each in folders
-        ]
-        core = _many(
-            wings.find(wings.VEHICLE_GROUP, wing), flight, [recorder for recorder, _ in logs], count=count,
-            seed=flight.scenario.seed, system_id=system_id, one_link=one_link,
-            ports=("offboard", *["gcs"] * (len(opened[0]) - 1)), states=states, logs=folders,
-            unix_us=unix_clock, trusted=is_loopback(links[0].bind),
-        )  # fmt: skip
+        with Herald(boot, speakers) as herald:
+            unix_clock = _steady_unix_clock()
+            logs = [
+                stack.enter_context(_logs(each, "vehicle", flight, log_failed, boot_us=unix_clock()))
+                for each in folders
+            ]
+            core = _many(
+                wings.find(wings.VEHICLE_GROUP, wing), flight, [recorder for recorder, _ in logs], count=count,
+                seed=flight.scenario.seed, system_id=system_id, one_link=one_link,
+                ports=("offboard", *["gcs"] * (len(opened[0]) - 1)), states=states, logs=folders,
+                unix_us=unix_clock, trusted=is_loopback(links[0].bind),
+            )  # fmt: skip
+        if herald.sequence:
+            for vehicle in core.vehicles:
+                vehicle.continue_from(herald.sequence)
         per_group = len(opened[0])
         ports = _Ports(opened)
+        from mavsitl import seeds  # here, for it loads numpy
+
         lives = []
         for j, group in enumerate(opened):
             vehicle = core.vehicles[j]
@@ -655,6 +666,7 @@ def fleet_realtime(
                 polled=lambda: ports.polled(lives), speed=speed, until_finished=until_finished,
                 stop=stop, say=report, progress=progress,
             )  # fmt: skip
+        _record_links((tap for _, tap in logs), timing.simulated_us)
         flown = tuple(
             Flown(
                 vehicle.system_id, vehicle.succeeded,
@@ -664,6 +676,13 @@ def fleet_realtime(
             for j, vehicle in enumerate(core.vehicles)
         )  # fmt: skip
         return _fleet_outcome(core, timing.simulated_us, monotonic_us() - started_us, flown, timing=timing)
+
+
+def _record_links(taps: Iterable[Tap], now_us: int) -> None:
+    """The last row of each: what the links did in all."""
+    for tap in taps:
+        if tap.record is not None:
+            tap.record(now_us)
 
 
 def _close_all(links: list[Link]) -> None:
@@ -757,12 +776,7 @@ def ground_fleet(
 def fleet_in_memory(
     flight: Flight, folder: Path | None, *, count: int, report: Callable[[str], None], progress: Progress | None
 ) -> FleetOutcome:
-    """A fleet and its controllers in this process, in lock-step.
-
-    Raises `ScenarioError` for links that are not perfect.
-    """
-    if flight.scenario.impaired:
-        raise ScenarioError(f"{flight.name}: link, chaos: a fleet in memory has perfect links; allowed: absent")
+    """A fleet and its controllers in this process, in lock-step; each pair has a link of its own."""
     with ExitStack() as stack:
         folders = [_fleet_folder(folder, j) for j in range(count)]
         vehicle_logs = [stack.enter_context(_logs(each, "vehicle", flight)) for each in folders]
@@ -776,12 +790,43 @@ def fleet_in_memory(
         taps = [tap for _, tap in vehicle_logs]
         for tap, (_, ground_tap) in zip(taps, ground_logs, strict=True):
             tap.flush = _both(tap.flush, ground_tap.flush)
+        channels = [lockstep_channels(flight, j) for j in range(count)]
+        for vehicle, own, (recorder, tap) in zip(core.vehicles, channels, vehicle_logs, strict=True):
+            _watch_lockstep_link(vehicle, own, recorder, tap)
         started_us = monotonic_us()
-        end_us = fleet.fly_in_memory(core, core.vehicles, formation, taps, progress=progress)
+        end_us = fleet.fly_in_memory(
+            core, core.vehicles, formation, taps, progress=progress,
+            channels=[each for each in channels if each is not None],
+            max_time_s=flight.scenario.duration_s + IMPAIRED_GRACE_S if flight.scenario.impaired else inf,
+        )  # fmt: skip
+        wall_us = monotonic_us() - started_us
+        _record_links(taps, end_us)
         flown = tuple(
-            replace(each, wire_hash=tap.wire.hexdigest()) for each, tap in zip(formation.flown(), taps, strict=True)
+            replace(
+                each,
+                finished=each.finished and vehicle.finished,
+                wire_hash=tap.wire.hexdigest(),
+                link=_statistics(own),
+            )
+            for each, vehicle, tap, own in zip(formation.flown(), core.vehicles, taps, channels, strict=True)
         )
-        return _fleet_outcome(core, end_us, monotonic_us() - started_us, flown)
+        if flight.scenario.fleet.on_collision == "crash":
+            flown = _crashed(flown, core.collisions)
+        return _fleet_outcome(core, end_us, wall_us, flown)
+
+
+def _crashed(flown: Sequence[Flown], collisions: Sequence[fleet.Collision]) -> tuple[Flown, ...]:
+    """Who has collided is lost, wherever the pieces came down; the ground need not have seen it."""
+    first: dict[int, str] = {}
+    for each in collisions:
+        for system_id, other in ((each.vehicle, each.other), (each.other, each.vehicle)):
+            first.setdefault(system_id, f"collided with vehicle {other} at t = {each.time_s:.2f} s")
+    return tuple(
+        replace(each, finished=False, lost="; ".join(filter(None, (first[each.system_id], each.lost))))
+        if each.system_id in first
+        else each
+        for each in flown
+    )
 
 
 def _both(one: Callable[[], None] | None, other: Callable[[], None] | None) -> Callable[[], None]:

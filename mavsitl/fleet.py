@@ -11,7 +11,7 @@ import selectors
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from mavsitl.clock import CATCH_UP_US, PacedClock, monotonic_us
 from mavsitl.drivers import (
@@ -25,11 +25,16 @@ from mavsitl.drivers import (
     Progress,
     RealTime,
     Tap,
+    exchange_impaired,
+    ground_in_memory,
 )
 from mavsitl.keep import Keeper, Keeping
 from mavsitl.link.base import Link
 from mavsitl.link.budget import Excess
 from mavsitl.log.tlog import Direction
+
+if TYPE_CHECKING:
+    from mavsitl.link.impaired import Channels
 
 LOOK_S = 0.001
 """Real time: between two looks at the sockets within a control period, so that what comes is taken together."""
@@ -245,12 +250,17 @@ def fly_in_memory(
     *,
     max_time_s: float = math.inf,
     progress: Progress | None = None,
+    channels: Sequence[Channels] = (),
 ) -> int:
     """Each of the fleet's `vehicles` with its ground of `formation`, in lock-step in this process, to the end of all.
 
     Returns the microseconds simulated. A pair that has finished exchanges nothing more; what a tap hears is what it
-    would hear of the pair alone. Raises `LockstepError` when a ground stops answering or `max_time_s` is over.
+    would hear of the pair alone. `channels`: what is between each vehicle and its ground; empty: nothing, every message
+    comes in the tick it was sent. Raises `LockstepError` when a ground stops answering or `max_time_s` is over; over an
+    impaired link a pair that has not ended by then, or whose ground gave up, is one that has not finished.
     """
+    if channels:
+        return _fly_impaired(fleet, vehicles, formation, taps, channels, max_time_s, progress)
     grounds = formation.grounds
     now_us, last_us = 0, max_time_s * 1e6
     ground_us = [0] * len(grounds)
@@ -284,6 +294,38 @@ def fly_in_memory(
             return now_us
         if now_us >= last_us:
             raise LockstepError(f"the flights did not end within {max_time_s:g} s of simulated time")
+        if progress is not None and now_us - progressed_us >= PROGRESS_INTERVAL_US:
+            progressed_us = now_us
+            progress(fleet.flight_time_s)
+        now_us += fleet.period_us
+
+
+def _fly_impaired(
+    fleet: FleetCore,
+    vehicles: Sequence[Any],
+    formation: FormationCore,
+    taps: Sequence[Tap],
+    channels: Sequence[Channels],
+    max_time_s: float,
+    progress: Progress | None,
+) -> int:
+    exchanges = [ground_in_memory(ground) for ground in formation.grounds]
+    flying = list(range(len(exchanges)))
+    now_us, last_us = 0, max_time_s * 1e6
+    progressed_us = 0
+    while True:
+        fleet.step(now_us)
+        said = dict(fleet.outgoing())
+        ended = set()
+        for port in flying:
+            if exchange_impaired(
+                vehicles[port], said.get(port, ()), channels[port], exchanges[port], taps[port], now_us
+            ):
+                ended.add(port)
+            formation.tally(port)
+        flying = [port for port in flying if port not in ended]
+        if not flying or now_us >= last_us:
+            return now_us
         if progress is not None and now_us - progressed_us >= PROGRESS_INTERVAL_US:
             progressed_us = now_us
             progress(fleet.flight_time_s)

@@ -1,4 +1,4 @@
-"""The first words of a vehicle: its HEARTBEAT, said while the vehicle behind it is still being loaded.
+"""The first words of a vehicle, or of each of a fleet: a HEARTBEAT, said while what is behind it is being loaded.
 
 Loading numpy, numba and the compiled kernels takes most of a second, compiling them for the first time many. Clients
 give a vehicle up after 3 s without a HEARTBEAT and look for it once a second. So the wing gives the bridge a HEARTBEAT
@@ -7,7 +7,7 @@ that says MAV_STATE_BOOT and that costs no more to make than the dialect; the ve
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from threading import Event, Thread
 from types import TracebackType
 from typing import TypeAlias
@@ -23,21 +23,20 @@ Beat: TypeAlias = Callable[[int, int], bytes]
 
 
 class Herald:
-    """Within its context the links carry a HEARTBEAT at once and then every second.
+    """Within its context the links carry a HEARTBEAT of each vehicle at once and then every second.
 
     It only sends. What clients say meanwhile waits in their sockets for the vehicle.
 
     Attributes:
-        sequence: the sequence number that comes next, the same on every link.
+        sequence: the sequence number that comes next, the same on every link and of every vehicle.
     """
 
     def __init__(
-        self, beat: Beat | None, system_id: int, links: Sequence[Link], interval_s: float = INTERVAL_S
+        self, beat: Beat | None, vehicles: Mapping[int, Sequence[Link]], interval_s: float = INTERVAL_S
     ) -> None:
-        """`beat` None: the wing has no such HEARTBEAT, and nothing is sent."""
+        """`vehicles`: links by system id. `beat` None: the wing has no such HEARTBEAT, and nothing is sent."""
         self._beat = beat
-        self._system_id = system_id
-        self._links = links
+        self._vehicles = vehicles
         self._interval_s = interval_s
         self._done = Event()
         self._thread = Thread(target=self._run, name="herald", daemon=True)
@@ -65,7 +64,8 @@ class Herald:
                 return  # the vehicle meets the same error, and says so
 
     def _say(self, beat: Beat) -> None:
-        frame = beat(self.sequence, self._system_id)
-        self.sequence = (self.sequence + 1) & 0xFF
-        for link in self._links:
-            link.send(frame)
+        sequence, self.sequence = self.sequence, (self.sequence + 1) & 0xFF
+        for system_id, links in self._vehicles.items():
+            frame = beat(sequence, system_id)
+            for link in links:
+                link.send(frame)

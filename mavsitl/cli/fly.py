@@ -24,13 +24,13 @@ from mavsitl.cli.common import (
     run_folder,
     settings_of,
 )
-from mavsitl.cli.ends import COUNT, fleet_table
+from mavsitl.cli.ends import COUNT
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
-    from mavsitl.report.run import FlightRecord
+    from mavsitl.report.run import FleetRecord, FlightRecord
     from mavsitl.report.tables import Row
     from mavsitl.scenario import Flight
 
@@ -68,7 +68,7 @@ def add(commands: Any) -> None:
     group.add_argument("--in-memory", action="store_true", help="both ends in one process, no sockets; the same bytes")
     group.add_argument(
         "--count", type=COUNT, metavar="N",
-        help="a formation of N vehicles, each with its controller, in one process; logs and a table, no report",
+        help="a formation of N vehicles, each with its controller, in one process",
     )  # fmt: skip
     group.add_argument("--no-report", action="store_true", help="logs and tables only")
     add_json(group, "the result")
@@ -107,16 +107,21 @@ def _fly(options: argparse.Namespace) -> int:
 
 
 def _fly_fleet(options: argparse.Namespace, flights: list[Flight]) -> int:
-    """A formation in memory; there is no page for one, each vehicle's logs have a folder."""
+    """A formation in memory."""
     from mavsitl import ends
     from mavsitl.cli import screen
     from mavsitl.clock import utc_stamp
+    from mavsitl.report import fleet, tables
+    from mavsitl.report import run as runs
+    from mavsitl.report.html import write_page
 
     if len(flights) != 1:
         raise UsageError(f"--count: name one scenario, such as formation-spiral; {len(flights)} were to fly")
     (flight,) = flights
-    folder = run_folder(options.run_dir, utc_stamp())
+    created = utc_stamp()
+    folder = run_folder(options.run_dir, created)
     title = f"{flight.name}, {options.count} vehicles"
+    console = screen.console(stderr=options.json)
     with logs_in(folder), screen.console(stderr=True).status(title) as shown:
 
         def move(time_s: float) -> None:
@@ -125,13 +130,31 @@ def _fly_fleet(options: argparse.Namespace, flights: list[Flight]) -> int:
         outcome = ends.fleet_in_memory(
             flight, folder / flight.name, count=options.count, report=lambda text: None, progress=move
         )
+        shown.update(f"{title}: reading the logs")
+        names = {each.system_id: f"{flight.name}/vehicle-{each.system_id - 1}" for each in outcome.vehicles}
+        paths = {number: folder / name for number, name in names.items()}
+        tracks = fleet.load_tracks(paths, flight.scenario.duration_s)
+        flown = fleet.fleet_record(flight.scenario.fleet, outcome, names, fleet.measure(tracks))
+        record = runs.record(
+            flight, folder=flight.name, wire_hash=fleet.wire_hash(flown.vehicles), real_time_factor=outcome.speed,
+            dropped=outcome.dropped, fleet=flown,
+        )  # fmt: skip
+        run = runs.new_run(command_line(), created, (record,))
+        runs.write_run(folder, run)
+        page = None if options.no_report else write_page(folder, fleet.render(run, tracks))
     if options.json:
-        print_json(outcome.as_event() | {"folder": str(folder)})
+        results = _as_json([(record, tables.rows(tracks.rmse(), None))])
+        print_json(outcome.as_event() | {"folder": str(folder), "flights": results})
     else:
-        for line in fleet_table(outcome):
-            print(line)
-        print(f"logs: {folder}")
-    return EXIT_FAILED if outcome.lost or not outcome.finished else EXIT_OK
+        _show_fleet(console, record, flown)
+    if page is not None:
+        screen.line(console, f"report: {page}")
+    screen.line(console, f"logs:   {folder}")
+    lost = [vehicle for vehicle in flown.vehicles if vehicle.lost]
+    for vehicle in lost:
+        said = f"vehicle {vehicle.system_id} was lost after {vehicle.flight_time_s:.1f} s: {vehicle.lost}"
+        screen.line(console, f"{said}\nlook at: mavsitl log info {folder / vehicle.folder}", "bold red")
+    return EXIT_FAILED if lost or not outcome.finished else EXIT_OK
 
 
 def _fly_one(
@@ -193,7 +216,7 @@ def _show(console: Console, options: argparse.Namespace, folder: Path, records: 
             said = f"{record.name} was lost after {data.time_s[-1]:.1f} s: {record.lost}"
             lost.append(f"{said}\nlook at: mavsitl log info {folder / record.folder}")
     if options.json:
-        _print_json(folder, results)
+        print_json({"folder": str(folder), "flights": _as_json(results)})
     else:
         for record, rows in results:
             _show_flight(console, record, rows)
@@ -230,12 +253,39 @@ def _show_flight(console: Console, record: FlightRecord, rows: list[Row]) -> Non
         screen.line(console, f"link {link}")
 
 
-def _print_json(folder: Path, results: list[tuple[FlightRecord, list[Row]]]) -> None:
-    flights = [
+def _show_fleet(console: Console, record: FlightRecord, flown: FleetRecord) -> None:
+    """A row for each vehicle, and what came of all."""
+    from rich.markup import escape
+
+    from mavsitl.cli import screen
+    from mavsitl.report import fleet, tables
+
+    speed = f"{record.real_time_factor:.1f} x real time"
+    console.print(f"\n[bold]{escape(record.title)}[/]  {record.law}, {record.level}, seed {record.seed}, {speed}")
+    numbers = ("vehicle", "flown / s", "RMSE / m", "worst / m", "nearest / m", "to")
+    impaired = any(vehicle.links for vehicle in flown.vehicles)
+    links = ("lost to ground / %", "to vehicle / %") if impaired else ()
+    table = screen.table(*numbers, *links, "end", right=(*numbers, *links))
+    for vehicle in flown.vehicles:
+        lost = [f"{100.0 * (row.lost + row.outage):.1f}" for row in tables.link_rows(vehicle.links)]
+        table.add_row(
+            str(vehicle.system_id), f"{vehicle.flight_time_s:.1f}",
+            *("-" if each is None else tables.number(each) for each in (vehicle.rms_m, vehicle.worst_m)),
+            "-" if vehicle.nearest_m is None else tables.number(vehicle.nearest_m), str(vehicle.nearest or "-"),
+            *(lost if impaired else ()), escape(fleet.end_of(vehicle)),
+        )  # fmt: skip
+    console.print(table)
+    for each in flown.collisions:
+        where = f"vehicles {each.vehicle} and {each.other} at t = {each.time_s:.2f} s: {each.distance_m:.2f} m"
+        screen.line(console, f"collision of {where}")
+    screen.line(console, ", ".join(fleet.summary(flown)))
+
+
+def _as_json(results: list[tuple[FlightRecord, list[Row]]]) -> list[dict[str, Any]]:
+    return [
         {
             "flight": record,
             "rmse": [{"state": row.state, "ours": row.ours, "paper": row.paper, "ratio": row.ratio} for row in rows],
         }
         for record, rows in results
     ]
-    print_json({"folder": str(folder), "flights": flights})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,7 @@ WIDE = 80
 
 HELP = """\
 What is in a log, a log in another format, and where two flights part. LOG is a ULog (.ulg), a tlog, or the folder of a
-run; docs/howto/logs.md says with what else they open.
+run or of one vehicle of a fleet; docs/howto/logs.md says with what else they open.
 """
 LOG_EXAMPLES = """\
 examples:
@@ -37,14 +38,15 @@ examples:
 """
 INFO = """\
 Topics with rates and gaps, parameters, texts, and how the log ended; of a tlog messages, who sent them, and losses. Of
-a run's folder, each log in it.
+a run's folder, each log in it; of a fleet's, a row for each vehicle.
 """
 CONVERT = """\
 Write a log in the format that the ending of OUT says. Of a run's folder its ULogs are joined: a topic that both ends
 have is the vehicle's, the ground's has the next instance (vehicle_attitude_setpoint.1).
 
 {formats}
-OUT is there whole, or as it was before.
+OUT is there whole, or as it was before. Of a fleet, or of a run of several flights, each gets a file of its own: of
+OUT spiral.mcap they are spiral/vehicle-0.mcap and so on.
 """
 DIFF = """\
 Compare two logs, or two runs, topic by topic: whether they are the same to the byte, or from when on and by how much
@@ -59,7 +61,9 @@ def add(commands: Any) -> None:
     kinds = parser.add_subparsers(title="commands", dest="log_command", metavar="COMMAND", help="what to do")
 
     info = command(kinds, "info", "what is in a log", INFO)
-    info.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="a .ulg, a .tlog, or the folder of a run")
+    info.add_argument(
+        "logs", nargs="+", type=Path, metavar="LOG", help="a .ulg, a .tlog, or the folder of a run or fleet"
+    )
     info.add_argument("--parameters", action="store_true", help="list every parameter")
     add_json(info, "all of it")
     info.set_defaults(run=_info)
@@ -71,7 +75,9 @@ def add(commands: Any) -> None:
         CONVERT.format(formats="".join(f"  {each:13} {text}\n" for each, text in ENDINGS.items())),
     )
     convert.add_argument("log", type=Path, metavar="LOG", help="a .ulg, a .tlog, or the folder of a run")
-    convert.add_argument("out", type=Path, metavar="OUT", help="the file to write")
+    convert.add_argument(
+        "out", type=Path, metavar="OUT", help="the file to write, or of several flights their folder and ending"
+    )
     convert.add_argument(
         "--topic", action="append", default=[], metavar="NAME",
         help="write this one; may be repeated (default: all); mavsitl log info names them",
@@ -96,18 +102,54 @@ def _help(parser: argparse.ArgumentParser) -> int:
 
 
 def _info(options: argparse.Namespace) -> int:
+    from mavsitl.log.content import is_fleet
     from mavsitl.log.info import inspect
 
-    found = [info for path in options.logs for info in inspect(path)]
+    found = [inspect(path) for path in options.logs]
     if options.json:
-        print_json(found)
+        print_json([info for infos in found for info in infos])
         return EXIT_OK
     from mavsitl.cli import screen
 
     console = screen.console()
-    for info in found:
-        _show(console, info, all_parameters=options.parameters)
+    for infos in found:
+        if is_fleet(list({Path(info.path).parent: None for info in infos})) and not options.parameters:
+            _show_fleet(console, infos)
+            continue
+        for info in infos:
+            _show(console, info, all_parameters=options.parameters)
     return EXIT_OK
+
+
+_LEVELS = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING")
+"""Of texts that a row for a vehicle tells, the gravest first."""
+
+
+def _show_fleet(console: Console, infos: Sequence[LogInfo]) -> None:
+    """A row for each vehicle."""
+    from rich.markup import escape
+
+    from mavsitl.cli import screen
+
+    vehicles: dict[Path, list[LogInfo]] = {}
+    for info in infos:
+        vehicles.setdefault(Path(info.path).parent, []).append(info)
+    folder, first = next(iter(vehicles)).parent, next(iter(vehicles)).name
+    screen.line(console, f"{folder}: {len(vehicles)} vehicles", "bold")
+    numbers = ("logs", "MB", "duration / s", "topics", "frames lost", "texts")
+    table = screen.table("folder", *numbers, "ended", "gravest text", right=numbers, whole=("folder",))
+    for path, logs in vehicles.items():
+        texts = [text for info in logs for text in info.texts]
+        grave = sorted((text for text in texts if text.level in _LEVELS), key=lambda text: _LEVELS.index(text.level))
+        table.add_row(
+            path.name, str(len(logs)), f"{sum(info.size_bytes for info in logs) / 1e6:.2f}",
+            f"{max(info.duration_s for info in logs):.3f}", str(sum(len(i.topics) for i in logs if i.kind == "ULog")),
+            str(sum(source.lost for info in logs for source in info.sources)), str(len(texts)),
+            "cut" if any(info.cut_bytes for info in logs) else "whole",
+            escape(f"{grave[0].level}: {grave[0].text}") if grave else "",
+        )  # fmt: skip
+    console.print(table)
+    screen.line(console, f"one of them: mavsitl log info {folder / first}")
 
 
 def _show(console: Console, info: LogInfo, *, all_parameters: bool) -> None:
@@ -157,14 +199,17 @@ def _show(console: Console, info: LogInfo, *, all_parameters: bool) -> None:
 
 
 def _convert(options: argparse.Namespace) -> int:
-    from mavsitl.log.convert import convert
+    from mavsitl.log.convert import convert, outputs
 
-    topics = convert(options.log, options.out, options.topic)
-    size = options.out.stat().st_size
+    written = []
+    files = outputs(options.log, options.out)
+    for log, out in files.items():
+        topics = convert(log, out, options.topic)
+        written.append({"out": str(out), "bytes": out.stat().st_size, "topics": topics})
+        if not options.json:
+            print(f"{out}: {len(topics)} topics, {out.stat().st_size / 1e6:.2f} MB")
     if options.json:
-        print_json({"out": str(options.out), "bytes": size, "topics": topics})
-    else:
-        print(f"{options.out}: {len(topics)} topics, {size / 1e6:.2f} MB")
+        print_json(written[0] if len(files) == 1 else written)
     return EXIT_OK
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -23,7 +24,10 @@ Kind = Literal["ULog", "tlog"]
 
 WIRE_LOG = "link.tlog"
 RUN_LOGS = (VEHICLE_LOG, GROUND_LOG, WIRE_LOG)
-RUN_FILE = "run.json"
+VEHICLE_FOLDER = re.compile("vehicle-([0-9]{1,3})")
+"""Of a fleet's vehicle: the instance, its system id less 1."""
+NAMED = 9
+"""Flights that an error lists."""
 
 _STAMP = struct.Struct(">Q")
 _MAVLINK = {0xFE: 8, 0xFD: 12}
@@ -67,24 +71,57 @@ class Content:
         return max((int(table["timestamp"][-1]) for table in self.tables.values()), default=0)
 
 
+def flights_of(folder: Path) -> tuple[Path, ...]:
+    """The folders with the logs of one vehicle each: this, or those of a run's flights; of a fleet each vehicle's.
+
+    In the order of their names, ``vehicle-2`` before ``vehicle-10``. Empty where there is none.
+    """
+    if _has_logs(folder):
+        return (folder,)
+    found: list[Path] = []
+    for entry in _folders(folder):
+        if _has_logs(entry):
+            found.append(entry)
+        else:
+            found += [each for each in _folders(entry) if VEHICLE_FOLDER.fullmatch(each.name) and _has_logs(each)]
+    return tuple(found)
+
+
+def is_fleet(flights: Sequence[Path]) -> bool:
+    """Whether folders of `flights_of` are of vehicles that flew together."""
+    alike = len({each.parent for each in flights}) == 1
+    return len(flights) > 1 and alike and all(VEHICLE_FOLDER.fullmatch(each.name) for each in flights)
+
+
+def _has_logs(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in RUN_LOGS)
+
+
+def _folders(folder: Path) -> list[Path]:
+    def in_order(each: Path) -> list[str | int]:
+        return [int(part) if part.isdecimal() else part for part in re.split("([0-9]+)", each.name)]
+
+    return sorted((each for each in folder.iterdir() if each.is_dir()), key=in_order)
+
+
 def logs_of(path: Path) -> tuple[Path, ...]:
     """The logs that a path names: itself, or those in the folder of a flight, or of a run of one flight.
 
-    Raises `LogError` for what is not there, for a folder without logs, and for a run of several flights.
+    Raises `LogError` for what is not there, for a folder without logs, and where there are several flights or vehicles.
     """
     if not path.is_dir():
         if not path.exists():
             raise NoLogError(f"{path}: no such file or folder")
         return (path,)
-    found = tuple(path / name for name in RUN_LOGS if (path / name).is_file())
-    if found:
-        return found
-    flights = sorted(each for each in path.iterdir() if any((each / name).is_file() for name in RUN_LOGS))
-    if len(flights) == 1:
-        return logs_of(flights[0])
-    if flights:
-        raise NoLogError(f"{path}: a run of several flights; allowed: {', '.join(str(each) for each in flights)}")
-    raise NoLogError(f"{path}: a folder without logs; expected {', '.join(RUN_LOGS)}, or a run with them in a folder")
+    flights = flights_of(path)
+    if not flights:
+        raise NoLogError(f"{path}: a folder without logs; expected {', '.join(RUN_LOGS)}, or a run with them in a folder")
+    if len(flights) > 1:
+        what = f"a fleet of {len(flights)} vehicles, choose one" if is_fleet(flights) else "a run of several flights"
+        named = [str(each) for each in flights]
+        shown = named if len(named) <= NAMED else [*named[: NAMED - 2], "...", named[-1]]
+        raise NoLogError(f"{path}: {what}; allowed: {', '.join(shown)}")
+    return tuple(flights[0] / name for name in RUN_LOGS if (flights[0] / name).is_file())
 
 
 def load(path: Path) -> Content:

@@ -16,9 +16,30 @@ from typing import Any
 
 import numpy as np
 
-from mavsitl.log.content import Content, Table, flat, joined
+from mavsitl.log.content import Content, Table, flat, flights_of, joined
 from mavsitl.log.endings import ENDINGS, ONE_TOPIC
 from mavsitl.log.errors import LogError, NoLogError
+
+
+def outputs(source: Path, out: Path) -> dict[Path, Path]:
+    """What `convert` is to write: log or flight to file.
+
+    Of one it is `out`. Of a run of several flights, or of a fleet, each has a file that is named after its folder, in
+    a folder that is named after `out` without its ending; folders are made. Raises `LogError`.
+    """
+    ending = _ending(out)
+    flights = flights_of(source) if source.is_dir() else ()
+    if len(flights) < 2:
+        return {source: out}
+    common = Path(os.path.commonpath(flights))
+    into = out.with_name(out.name.removesuffix(ending))
+    files = {flight: into / f"{flight.relative_to(common)}{ending}" for flight in flights}
+    try:
+        for file in files.values():
+            file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogError(f"{into}: no folder can be made there: {error.strerror or error}") from error
+    return files
 
 
 def convert(source: Path, out: Path, topics: Sequence[str] = ()) -> tuple[str, ...]:

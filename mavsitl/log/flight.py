@@ -166,7 +166,7 @@ class FlightData:
         stamps = position["timestamp"]
         for table in (attitude, reference, commanded):
             stamps = np.intersect1d(stamps, table["timestamp"])
-        release_us = _release_us(vehicle)
+        release_us = release_us_of(vehicle)
         stamps = stamps[stamps >= release_us]
         if duration_s is not None:
             stamps = stamps[stamps <= release_us + round(duration_s * 1e6)]
@@ -225,7 +225,8 @@ def _need(tables: Tables, topic: Topic) -> Mapping[str, npt.NDArray[Any]]:
     return table
 
 
-def _release_us(vehicle: Tables) -> int:
+def release_us_of(vehicle: Tables) -> int:
+    """When the vehicle's log says that it flew first. Raises `FlightError` where it never did."""
     table = _need(vehicle, topics.LAND_DETECTED)
     airborne = np.flatnonzero(table["landed"] == 0)
     if not airborne.size:

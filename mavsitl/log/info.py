@@ -7,8 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from mavsitl.log.content import RUN_FILE, RUN_LOGS, Content, Kind, Table, load, logs_of
-from mavsitl.log.errors import LogError
+from mavsitl.log.content import Content, Kind, Table, flights_of, load, logs_of
 
 
 class TopicInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -69,13 +68,9 @@ class LogInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def inspect(path: Path) -> tuple[LogInfo, ...]:
-    """Of each log that the path names, of all flights of a run. Raises `LogError`."""
-    if (path / RUN_FILE).is_file():
-        folders = sorted(each for each in path.iterdir() if any((each / name).is_file() for name in RUN_LOGS))
-        if not folders:
-            raise LogError(f"{path}: a run without logs")
-        return tuple(describe(load(log)) for folder in folders for log in logs_of(folder))
-    return tuple(describe(load(log)) for log in logs_of(path))
+    """Of each log that the path names, of all flights of a run and all vehicles of a fleet. Raises `LogError`."""
+    folders = flights_of(path) if path.is_dir() else ()
+    return tuple(describe(load(log)) for folder in folders or (path,) for log in logs_of(folder))
 
 
 def describe(content: Content) -> LogInfo:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mavsitl.keep import replace_file
 from mavsitl.log.flight import FlightData, FlightError
 from mavsitl.log.ulog import LogError
 from mavsitl.px4_modes import NAV_STATES
@@ -94,12 +95,19 @@ class Shown:
 def write_report(run_folder: Path) -> Path:
     """Write `report.html` into the folder of a run and return its path. Raises `RunError` naming what is wrong."""
     run = load_run(run_folder)
-    page = render(run, [_load(run_folder, record) for record in run.flights])
-    path = run_folder / REPORT_FILE
-    new = run_folder / f"{REPORT_FILE}.new"
+    if run.flights and (record := run.flights[0]).fleet is not None:
+        from mavsitl.report import fleet  # here, for it needs `template`
+
+        folders = {vehicle.system_id: run_folder / vehicle.folder for vehicle in record.fleet.vehicles}
+        return write_page(run_folder, fleet.render(run, fleet.load_tracks(folders, record.duration_s)))
+    return write_page(run_folder, render(run, [_load(run_folder, record) for record in run.flights]))
+
+
+def write_page(folder: Path, page: str) -> Path:
+    """`report.html` whole or as it was before; its path. Raises `RunError`."""
+    path = folder / REPORT_FILE
     try:
-        new.write_text(page, "utf-8")
-        new.replace(path)
+        replace_file(path, page.encode())
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path

@@ -27,8 +27,56 @@ class NoRunError(RunError):
     exit_code = EXIT_USAGE
 
 
+class VehicleRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One vehicle of a fleet. `folder` is relative to the run's and holds `vehicle.ulg` and `ground.ulg`."""
+
+    system_id: int
+    folder: str
+    wire_hash: str
+    finished: bool
+    """It flew to the planned end."""
+    lost: str = ""
+    """How it was lost in flight; empty: it was not."""
+    flight_time_s: float
+    """0: it was never released."""
+    rms_m: float | None
+    """Distance of the true position from the reference, from the release on; None: it was never released."""
+    worst_m: float | None
+    nearest_m: float | None
+    """Least distance to another vehicle, from the fleet's first release on; None: there is no other."""
+    nearest: int | None
+    """That vehicle's system id."""
+    links: dict[str, dict[str, dict[str, float]]] = {}
+    """As of `FlightRecord`."""
+
+
+class CollisionRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Two vehicles, by system id, came nearer than the fleet's `collision_m`."""
+
+    time_s: float
+    """Simulated."""
+    vehicle: int
+    other: int
+    distance_m: float
+
+
+class FleetRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a flight of many has beside that of one: the scenario's `[fleet]`, and each vehicle."""
+
+    formation: str
+    spacing_m: float
+    shared_wind: bool
+    collision_m: float
+    on_collision: str
+    vehicles: tuple[VehicleRecord, ...]
+    """In the order of their system ids."""
+    collisions: tuple[CollisionRecord, ...] = ()
+
+
 class FlightRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What was flown. `folder` is relative to the run's and holds `vehicle.ulg` and `ground.ulg`."""
+    """What was flown. `folder` is relative to the run's and holds `vehicle.ulg` and `ground.ulg`; of a fleet a folder
+    for each vehicle, and `lost`, `links` are the vehicles', `wire_hash` is the digest of theirs.
+    """
 
     name: str
     title: str
@@ -53,6 +101,8 @@ class FlightRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """What the vehicle's impaired links did, by place and direction: `mavsitl.link.impaired.Statistics`."""
     dropped: dict[str, int] = {}
     """Input of the vehicle that was not taken, by reason: `mavsitl.codec.Counters`."""
+    fleet: FleetRecord | None = None
+    """None: a single vehicle flew."""
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -76,8 +126,9 @@ def record(
     lost: str = "",
     links: dict[str, dict[str, dict[str, float]]] | None = None,
     dropped: dict[str, int] | None = None,
+    fleet: FleetRecord | None = None,
 ) -> FlightRecord:
-    """What `run.json` says of a flight."""
+    """What `run.json` says of a flight. The paper has no fleets: one is compared with none of its tables."""
     scenario = flight.scenario
     return FlightRecord(
         name=flight.name,
@@ -92,11 +143,12 @@ def record(
         real_time_factor=real_time_factor,
         scenario_digest=scenario_digest(flight),
         duration_s=scenario.duration_s,
-        paper_case=paper_case(scenario),
+        paper_case=None if fleet else paper_case(scenario),
         wind=tuple(str(model.__struct_config__.tag) for model in scenario.wind),
         lost=lost,
         links=links or {},
         dropped=dropped or {},
+        fleet=fleet,
     )
 
 
@@ -138,12 +190,16 @@ def load_run(folder: Path) -> Run:
         raise RunError(f"{path}: not a run of mavsitl {mavsitl.__version__}: {error}") from error
     except msgspec.DecodeError as error:
         raise RunError(f"{path}: damaged, expected JSON: {error}") from error
+    if len(run.flights) > 1 and any(flight.fleet for flight in run.flights):
+        raise RunError(f"{path}: {len(run.flights)} flights; expected one, for it is a fleet's")
     for flight in run.flights:
-        inside = (folder / flight.folder).resolve()
-        if not inside.is_relative_to(folder.resolve()):
-            raise RunError(f"{path}: flight {flight.name}: folder {flight.folder!r} is outside the run's folder")
-        if not inside.is_dir():
-            raise RunError(f"{path}: flight {flight.name}: no folder {flight.folder!r}; expected one beside {RUN_FILE}")
+        vehicles = flight.fleet.vehicles if flight.fleet else ()
+        for name in (flight.folder, *(vehicle.folder for vehicle in vehicles)):
+            inside = (folder / name).resolve()
+            if not inside.is_relative_to(folder.resolve()):
+                raise RunError(f"{path}: flight {flight.name}: folder {name!r} is outside the run's folder")
+            if not inside.is_dir():
+                raise RunError(f"{path}: flight {flight.name}: no folder {name!r}; expected one beside {RUN_FILE}")
         if flight.paper_case is not None and flight.paper_case not in PAPER_TABLES:
             allowed = ", ".join(PAPER_TABLES)
             raise RunError(f"{path}: flight {flight.name}: paper_case {flight.paper_case!r} is not one of {allowed}")

@@ -5,7 +5,6 @@ Sans-IO but for the files, which are read once.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan
@@ -17,13 +16,14 @@ import numpy.typing as npt
 
 from mavsitl.dialect import mavlink
 from mavsitl.log import topics
+from mavsitl.log.content import VEHICLE_FOLDER
 from mavsitl.log.errors import LogError, NoLogError
 from mavsitl.log.flight import GROUND_LOG, VEHICLE_LOG
 from mavsitl.log.topics import Topic
 from mavsitl.log.ulog import read
 from mavsitl.px4_modes import NAV_STATES
 from mavsitl.quaternion import from_euler
-from mavsitl.report.run import RUN_FILE, load_run
+from mavsitl.report.run import RUN_FILE, FlightRecord, load_run
 from mavsitl.services.statustext import printable
 from mavsitl.view.model import ROW_INTERVAL_US, ROWS, Model, Row, Vehicle, put_link, row_of, shorten
 
@@ -45,9 +45,6 @@ class Recorded:
     folders: Mapping[int, Path]
 
 
-_FLEET = re.compile(r"vehicle-([0-9]{1,3})")
-
-
 def find_flights(path: Path) -> list[Recorded]:
     """The flights of a run's folder, in its order; or of a folder with logs, of one vehicle or of a fleet.
 
@@ -57,7 +54,7 @@ def find_flights(path: Path) -> list[Recorded]:
         flights = load_run(path).flights
         titles = [flight.title for flight in flights]
         return [
-            Recorded(title if titles.count(title) == 1 else f"{title} ({flight.folder})", {1: path / flight.folder})
+            Recorded(title if titles.count(title) == 1 else f"{title} ({flight.folder})", _folders(path, flight))
             for title, flight in zip(titles, flights, strict=True)
         ]
     found = _flight(path)
@@ -71,6 +68,12 @@ def find_flights(path: Path) -> list[Recorded]:
     return below
 
 
+def _folders(run: Path, flight: FlightRecord) -> dict[int, Path]:
+    if flight.fleet is None:
+        return {1: run / flight.folder}
+    return {vehicle.system_id: run / vehicle.folder for vehicle in flight.fleet.vehicles}
+
+
 def _flight(folder: Path) -> Recorded | None:
     if (folder / VEHICLE_LOG).is_file():
         return Recorded(folder.resolve().name, {1: folder})
@@ -79,7 +82,7 @@ def _flight(folder: Path) -> Recorded | None:
     fleet = {
         int(match[1]) + 1: entry
         for entry in folder.iterdir()
-        if (match := _FLEET.fullmatch(entry.name)) and (entry / VEHICLE_LOG).is_file()
+        if (match := VEHICLE_FOLDER.fullmatch(entry.name)) and (entry / VEHICLE_LOG).is_file()
     }
     return Recorded(folder.resolve().name, dict(sorted(fleet.items()))) if fleet else None
 

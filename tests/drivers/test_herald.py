@@ -36,7 +36,7 @@ def test_it_speaks_at_once_on_every_link_and_then_again() -> None:
             thrice.set()
         return boot.heartbeat(sequence, system_id)
 
-    herald = Herald(beat, 7, [near for near, _ in pairs], interval_s=0.001)
+    herald = Herald(beat, {7: [near for near, _ in pairs]}, interval_s=0.001)
     with herald:
         assert pairs[0][1].wait(0.0)
         assert thrice.wait(30.0)
@@ -47,9 +47,17 @@ def test_it_speaks_at_once_on_every_link_and_then_again() -> None:
     assert herald.sequence >= 4
 
 
+def test_it_speaks_for_each_of_a_fleet() -> None:
+    (one, far_one), (two, far_two) = memory_pair(), memory_pair()
+    with Herald(boot.heartbeat, {1: [one], 2: [one, two]}) as herald:
+        assert herald.sequence == 1
+    assert [(frame.system_id, frame.sequence) for frame in heard(far_one)] == [(1, 0), (2, 0)]
+    assert [(frame.system_id, frame.sequence) for frame in heard(far_two)] == [(2, 0)]
+
+
 def test_without_such_a_heartbeat_nothing_is_said() -> None:
     near, far = memory_pair()
-    with Herald(None, 1, [near]) as herald:
+    with Herald(None, {1: [near]}) as herald:
         pass
     assert herald.sequence == 0
     assert heard(far) == []
@@ -65,7 +73,7 @@ def test_a_link_that_fails_is_left_to_the_vehicle() -> None:
             said.set()
         return boot.heartbeat(sequence, system_id)
 
-    with Herald(beat, 1, [near], interval_s=0.001) as herald:
+    with Herald(beat, {1: [near]}, interval_s=0.001) as herald:
         assert said.wait(30.0)
         herald._thread.join(30.0)
         assert not herald._thread.is_alive()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mavsitl import ends, scenario
+from mavsitl.cli import main
 from mavsitl.log.errors import LogError
 from mavsitl.log.ulog import read
 from mavsitl.report.run import RUN_FILE, RunError, load_run, new_run, record, write_run
@@ -55,6 +56,17 @@ def test_it_finds_the_flights_of_a_run_a_folder_and_a_fleet(run: Path, fleet: Pa
     assert list(nine.folders) == [1, 2, 3]
     (nine,) = find_flights(fleet / "formation-spiral")
     assert list(nine.folders) == [1, 2, 3]
+
+
+def test_a_fleet_s_run_is_one_flight_of_its_vehicles(tmp_path: Path) -> None:
+    arguments = ["fly", "formation-spiral", "--count", "2", "--duration", "1", "--no-report"]
+    assert main([*arguments, "--run-dir", str(tmp_path)]) == 0
+    (flight,) = find_flights(tmp_path)
+    assert flight.name == "Spirals in formation"
+    assert flight.folders == {number: tmp_path / f"formation-spiral/vehicle-{number - 1}" for number in (1, 2)}
+    replay = Replay([flight])
+    replay.seek(1.0)
+    assert all(replay.model.vehicles[number].values["attitude"] for number in (1, 2))
 
 
 def test_flights_of_one_title_are_told_apart_by_their_folders(run: Path, tmp_path: Path) -> None:
