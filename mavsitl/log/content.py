@@ -115,7 +115,9 @@ def logs_of(path: Path) -> tuple[Path, ...]:
         return (path,)
     flights = flights_of(path)
     if not flights:
-        raise NoLogError(f"{path}: a folder without logs; expected {', '.join(RUN_LOGS)}, or a run with them in a folder")
+        raise NoLogError(
+            f"{path}: a folder without logs; expected {', '.join(RUN_LOGS)}, or a run with them in a folder"
+        )
     if len(flights) > 1:
         what = f"a fleet of {len(flights)} vehicles, choose one" if is_fleet(flights) else "a run of several flights"
         named = [str(each) for each in flights]

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
+import time
 from pathlib import Path
 
+import pytest
+from numba import config
+
+from mavsitl import kernel_cache
 from tests.downstream import steps
 
 PROGRAM = """
@@ -45,3 +51,16 @@ def test_another_place_meets_them_and_another_text_does_not(tmp_path: Path) -> N
         file.write("# another text of what a kernel may call\n")
     assert counts(second, cache) == (0, 1)
     assert counts(first, cache) == (1, 0)
+
+
+def test_kernels_that_nobody_uses_make_room_for_new_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(config, "CACHE_DIR", "")
+    ago = {"long": 1.1 * kernel_cache.KEPT_S, "used": 1.1 * kernel_cache.KEPT_S, "lately": 0.9 * kernel_cache.KEPT_S}
+    for name, age_s in ago.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "kernel.nbi").touch()
+        os.utime(tmp_path / name, times=(time.time() - age_s,) * 2)
+    kernel_cache.set_up(tmp_path / "used")
+    assert {each.name for each in tmp_path.iterdir()} == {"long", "used", "lately"}
+    kernel_cache.set_up(tmp_path / "new")
+    assert {each.name for each in tmp_path.iterdir()} == {"used", "lately", "new"}
