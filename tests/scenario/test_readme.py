@@ -31,10 +31,11 @@ def test_ci_runs_the_readmes_test_command() -> None:
     assert from_readme == from_ci
 
 
-def test_the_readmes_main_job_installs_with_the_pins_and_flies() -> None:
-    [line] = [line for line in commands(README) if line.startswith("git clone")]
-    assert "-c constraints.txt" in line
-    assert line.endswith("mavsitl fly")
+def test_the_readmes_first_commands_install_with_the_pins_and_fly() -> None:
+    fly, vehicle = (line for line in commands(README) if line.startswith("git clone"))
+    assert "-c constraints.txt" in fly
+    assert fly.endswith("mavsitl fly")
+    assert vehicle == fly.removesuffix("fly") + "vehicle"
 
 
 def test_the_readme_names_every_shipped_scenario_it_names_rightly() -> None:
