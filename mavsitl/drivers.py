@@ -13,12 +13,11 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
-from mavsitl.clock import CATCH_UP_US, LatenessHistogram, PacedClock, monotonic_us
+from mavsitl.clock import CATCH_UP_US, LatenessHistogram, PacedClock, monotonic_us, processor_s
 from mavsitl.keep import Keeper, Keeping
 from mavsitl.link.base import Link, LinkError, LinkSilent
 from mavsitl.link.budget import Excess, FairQueue, InputBudget
@@ -740,21 +739,20 @@ class LostTime:
 class Load:
     """Measures the share of a processor that this process takes: SYS_STATUS.load."""
 
-    def __init__(self, tell: Callable[[float], None], used_ns: Callable[[], int] = time.process_time_ns) -> None:
+    def __init__(self, tell: Callable[[float], None]) -> None:
         self._tell = tell
-        self._used_ns = used_ns
         self._begin_us: int | None = None
-        self._begin_ns = 0
+        self._begin_s = 0.0
 
     def step(self, now_us: int) -> None:
         """To be called on the wall clock, often."""
         begin_us = self._begin_us
         if begin_us is not None and now_us < begin_us + LOAD_US:
             return
-        used_ns = self._used_ns()
+        used_s = processor_s()
         if begin_us is not None:
-            self._tell((used_ns - self._begin_ns) / (now_us - begin_us) * 1e-3)
-        self._begin_us, self._begin_ns = now_us, used_ns
+            self._tell((used_s - self._begin_s) / (now_us - begin_us) * 1e6)
+        self._begin_us, self._begin_s = now_us, used_s
 
 
 def run_realtime_ground(

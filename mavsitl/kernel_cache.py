@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +79,7 @@ def _mark_used(folder: Path) -> None:
             os.utime(folder)
             return
         folder.mkdir(parents=True)
-        oldest_s = time.time() - KEPT_S
+        oldest_s = folder.stat().st_mtime - KEPT_S
         unused = [each for each in folder.parent.iterdir() if each.stat().st_mtime < oldest_s]
     except OSError:
         return  # read-only, or another process tidies up: numba says what it cannot write

@@ -43,12 +43,12 @@ def run(folder: Path, *arguments: str) -> int:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--set", "wind.speed=1,2"], "wind[0].speed: unknown key; allowed here: model, speed_20ft_m_s, altitude_m"),
+        (["--set", "wind.speed=1,2"], "wind[0].speed: unknown key; did you mean speed_20ft_m_s? allowed here: model, "),
         (["--set", "controller.law=pid,lqr"], "controller.law: 'lqr' is not allowed; allowed: 'pid', 'pidnn'"),
         (["--set", "duration_s=1,2", "--set", "duration_s=3"], "duration_s: given 2 times; allowed: once, with all"),
         (["--compare", "controller.law=pid"], "--compare controller.law: one value alone; allowed: two or more"),
         (["--set", "duration_s"], "duration_s: not KEY=VALUE or KEY=A,B,C"),
-        (["--seeds", "1,1"], "1,1: a seed is there twice"),
+        (["--seeds", "1,1"], "seeds 1,1: one is there twice"),
         (["--scheduler", "tcp://127.0.0.1:9"], "--jobs: not with --scheduler"),
     ],
 )

@@ -15,7 +15,7 @@ from mavsitl import drivers, ends, pair
 from mavsitl.clock import PacedClock
 from mavsitl.codec import parse
 from mavsitl.dialect import mavlink
-from mavsitl.drivers import Load, Tap
+from mavsitl.drivers import Tap
 from mavsitl.ends import NullRecorder, VehicleLinks
 from mavsitl.link.address import Address
 from mavsitl.link.base import Link
@@ -111,7 +111,7 @@ def test_a_vehicle_flies_on_the_wall_clock(wall: Wall, speed: float) -> None:
 
 def test_a_vehicle_says_how_busy_its_process_is(wall: Wall, monkeypatch: pytest.MonkeyPatch) -> None:
     """SYS_STATUS.load and cpuload in the log: 0 until the first second is over, then what the last second took."""
-    monkeypatch.setattr(drivers, "Load", lambda tell: Load(tell, lambda: wall.ns // 4))
+    monkeypatch.setattr(drivers, "processor_s", lambda: wall.ns / 4e9)
     log = MemoryRecorder()
     vehicle = Vehicle(shortened("hover-calm", 1.0), log, seed=1)
     near, far = memory_pair()

@@ -45,6 +45,9 @@ class Wall:
     def time_ns(self) -> int:
         return self.date_ns + self.ns
 
+    def process_time(self) -> float:
+        return self.ns / 4e9
+
     def sleep(self, duration_s: float) -> None:
         self.ns += max(round(duration_s * 1e9), 1000)
 
