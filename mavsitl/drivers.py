@@ -171,7 +171,13 @@ class Tap:
         heard, self._heard = self._heard, []
         self._wire.update(heard)
         if self.tlog is not None:
-            self.tlog.write([_without_keys(each) if SETUP_SIGNING_ID in each[2] else each for each in heard])
+            # A key is not to be read in a log. A vehicle sends none, and passes none on.
+            self.tlog.write(
+                [
+                    each if each[0] is FROM_VEHICLE or SETUP_SIGNING_ID not in each[2] else _without_keys(each)
+                    for each in heard
+                ]
+            )
 
     def tick(self, now_us: int, wall_us: int = 0) -> None:
         """Once a control period, or every few. `wall_us`: in real time, where simulated time may be slower."""
@@ -188,16 +194,11 @@ class Tap:
 
 
 def _without_keys(heard: Heard) -> Heard:
-    """Of the ground's the good frames that are no SETUP_SIGNING: a key is not to be read in a log.
-
-    A vehicle sends no key, and passes none on.
-    """
+    """The good frames that are no SETUP_SIGNING."""
     from mavsitl.codec import parse
 
     direction, now_us, datagram = heard
-    if direction is FROM_GROUND:
-        datagram = b"".join(frame.raw for frame in parse(datagram) if frame.message_id != SETUP_SIGNING)
-    return direction, now_us, datagram
+    return direction, now_us, b"".join(frame.raw for frame in parse(datagram) if frame.message_id != SETUP_SIGNING)
 
 
 class _Throttle:
