@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from math import hypot, inf, nan
 from typing import TYPE_CHECKING
 
@@ -52,7 +53,7 @@ def _to_wire(largest_rad_s: float) -> Array:
 
 
 def _flown(*kinds: float) -> Callable[[Array], NDArray[np.bool_]]:
-    return lambda v: np.isin(v[:, tick.LOG_KIND], kinds)
+    return lambda v: reduce(np.logical_or, [v[:, tick.LOG_KIND] == kind for kind in kinds])
 
 
 _ATTITUDE_FLOWN = _flown(tick.ATTITUDE_KIND)
@@ -86,9 +87,7 @@ class Record:
         to_wire = _to_wire(flight.airframe.max_rotor_speed_rad_s)
 
         def newest(count: int) -> Array:
-            rows = simulation.logged(column, count)
-            rows *= to_wire
-            return rows
+            return simulation.logged(column, count) * to_wire
 
         self._window = Window(recorder, self._groups(), newest, scenario.rates.control_period_us)
         self._sensors = SensorRecord(recorder, flight) if has_sensors(scenario) else None

@@ -312,8 +312,10 @@ class Simulation:
         self.estimates = self._by_vehicle.tolist()
 
     def logged(self, j: int, count: int) -> tick.Array:
-        """(count, tick.LOG_WIDTH) of vehicle `j`: now, and the ticks before it, the oldest first."""
-        return self._log[np.arange(self._tick - count + 1, self._tick + 1) % BLOCK_ROWS, :, j]
+        """(count, tick.LOG_WIDTH) of vehicle `j`: now, and the ticks before it, the oldest first; not to be kept."""
+        end = self._tick % BLOCK_ROWS + 1
+        begin, log = end - count, self._log[:, :, j]
+        return log[begin:end] if begin >= 0 else np.concatenate((log[begin:], log[:end]))
 
     def _advance_sensed(self, sensed: SensedEstimator, number: int) -> None:
         field, unit = self.field, sensed.imu
