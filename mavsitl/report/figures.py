@@ -120,6 +120,18 @@ def position(flights: Flights, counterpart: str) -> Drawing:
     return Drawing(svg(draw, 5.2, "position"), "Position by axis", counterpart)
 
 
+def dress_space(axes: Any, *, labelpad: int, height: float, zoom: float, elevation: int) -> None:
+    """Labels, view and planes of 3D axes; `height` in multiples of the width."""
+    axes.set_xlabel("x / m", labelpad=labelpad)
+    axes.set_ylabel("y / m", labelpad=labelpad)
+    axes.set_zlabel("z / m", labelpad=labelpad - 2)
+    axes.set_box_aspect((1.0, 1.0, height), zoom=zoom)
+    axes.view_init(elev=elevation, azim=-55)
+    for plane in (axes.xaxis, axes.yaxis, axes.zaxis):
+        plane.pane.set_facecolor("#fafafc")
+        plane.pane.set_edgecolor("#d4d4da")
+
+
 def path_3d(flights: Flights, counterpart: str) -> Drawing:
     def draw(figure: Figure) -> None:
         axes: Any = figure.add_axes((0.12, 0.0, 0.76, 0.98), projection="3d", computed_zorder=False)
@@ -135,14 +147,7 @@ def path_3d(flights: Flights, counterpart: str) -> Drawing:
             label="reference",
             zorder=3,
         )
-        axes.set_xlabel("x / m", labelpad=8)
-        axes.set_ylabel("y / m", labelpad=8)
-        axes.set_zlabel("z / m", labelpad=6)
-        axes.set_box_aspect((1.0, 1.0, 0.85), zoom=0.95)
-        axes.view_init(elev=22, azim=-55)
-        for plane in (axes.xaxis, axes.yaxis, axes.zaxis):
-            plane.pane.set_facecolor("#fafafc")
-            plane.pane.set_edgecolor("#d4d4da")
+        dress_space(axes, labelpad=8, height=0.85, zoom=0.95, elevation=22)
         figure.legend(*axes.get_legend_handles_labels(), loc="upper left", ncols=1)
 
     return Drawing(svg(draw, 6.2, "path"), "Path in space", counterpart)

@@ -9,7 +9,7 @@ import numpy as np
 
 from mavsitl.log.flight import Array
 from mavsitl.report import tables
-from mavsitl.report.figures import BROKEN, POINTS, REFERENCE, UNDERNEATH, Drawing, decimate, svg
+from mavsitl.report.figures import BROKEN, POINTS, REFERENCE, UNDERNEATH, Drawing, decimate, dress_space, svg
 from mavsitl.report.run import FleetRecord, VehicleRecord
 
 if TYPE_CHECKING:
@@ -138,14 +138,7 @@ def _space(tracks: Tracks) -> Drawing:
         for _, track, colour, _ in _lines(tracks):
             axes.plot(*_thinned(track.reference_nwu_m, count).T, **_dashed(count))
             axes.plot(*_thinned(track.position_nwu_m, count).T, color=colour, linewidth=_width(count), zorder=2)
-        axes.set_xlabel("x / m", labelpad=6)
-        axes.set_ylabel("y / m", labelpad=6)
-        axes.set_zlabel("z / m", labelpad=4)
-        axes.set_box_aspect((1.0, 1.0, 0.7), zoom=0.92)
-        axes.view_init(elev=24, azim=-55)
-        for plane in (axes.xaxis, axes.yaxis, axes.zaxis):
-            plane.pane.set_facecolor("#fafafc")
-            plane.pane.set_edgecolor("#d4d4da")
+        dress_space(axes, labelpad=6, height=0.7, zoom=0.92, elevation=24)
 
     return Drawing(svg(draw, 5.6, "space", _HALF_IN), "Paths in space, references dashed", "", half=True)
 
